@@ -1,0 +1,1 @@
+"""The Trigpoint daemon: everything that waits."""

@@ -1,0 +1,1 @@
+"""Off-line tools on maps, recordings and results."""

@@ -1,0 +1,1 @@
+"""Trigpoint: where am I, from pictures. The library: pure computation."""

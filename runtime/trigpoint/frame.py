@@ -1,0 +1,141 @@
+"""What goes into the localizer and what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trigpoint.camera import Camera
+from trigpoint.rigid import Rigid3
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture of one camera.
+
+    Parameters
+    ----------
+    image : (height, width) uint8
+        Gray levels.
+    camera : Camera
+        Of the same size as the image.
+    time_ns : int
+        Capture time, nanoseconds in the source's clock.
+    name : str
+        For people: a file name, a topic.
+    """
+
+    image: NDArray[np.uint8]
+    camera: Camera
+    time_ns: int = 0
+    name: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class LocalFeatures:
+    """Keypoints of one image, best score first, with descriptors, and its global descriptor.
+
+    Parameters
+    ----------
+    keypoints : (N, 2) float32
+        In px of the original image, top-left pixel centre at (0, 0).
+    descriptors : (N, D) float32
+        L2-normalised.
+    scores : (N,) float32
+        The detector's logits.
+    global_descriptor : (G,) float32
+        L2-normalised, for retrieval.
+    """
+
+    keypoints: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+    scores: NDArray[np.float32]
+    global_descriptor: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+@dataclass(frozen=True)
+class ModelIdentity:
+    """Which network made the features; features of different networks do not match."""
+
+    name: str
+    sha256: str  # of the files it is made of
+    descriptor_dim: int
+    global_dim: int
+
+
+@dataclass(frozen=True, eq=False)
+class Anchor:
+    """A reference image of the map, with its known pose."""
+
+    name: str
+    camera: Camera
+    cam_from_world: Rigid3
+    keypoints: NDArray[np.float32]  # (N, 2) px
+    descriptors: NDArray[np.float32]  # (N, D), L2-normalised
+
+
+class Reason(StrEnum):
+    """Why a frame was not localized."""
+
+    NO_MAP = "NO_MAP"  # the map holds no image
+    TOO_DARK = "TOO_DARK"  # hardly any light or contrast in the frame
+    FEW_FEATURES = "FEW_FEATURES"  # the frame shows too few keypoints
+    FEW_MATCHES = "FEW_MATCHES"  # no anchor shares enough of them: not a place in the map
+    FEW_ANCHORS = "FEW_ANCHORS"  # fewer than two anchors agree on a pose
+    DEGENERATE_ANCHORS = "DEGENERATE_ANCHORS"  # the anchors see the frame along one line
+    FEW_INLIERS = "FEW_INLIERS"  # too few latent points agree with the refined pose
+    HIGH_UNCERTAINTY = "HIGH_UNCERTAINTY"  # a pose was found, but not a certain one
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Counts and stage times of one localization; what was not reached is 0 or absent."""
+
+    num_features: int = 0
+    num_anchors: int = 0  # retrieved
+    num_matches: int = 0  # over all anchors
+    num_relative_poses: int = 0  # anchors that agree in stage 1
+    num_points: int = 0  # latent points
+    num_inliers: int = 0  # latent points that agree with the final pose
+    generator: str = ""  # which hypothesis was refined: "anchor_pairs" or "latent_points"
+    anchors: tuple[str, ...] = ()  # names, best first
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Localized:
+    """A pose that may be used.
+
+    Parameters
+    ----------
+    cam_from_world : Rigid3
+        The camera's pose.
+    covariance : (6, 6) float64
+        Of the error (dc, dtheta): the true center is center + dc, in the world's axes and units;
+        the true world_from_cam rotation is exp(dtheta) world_from_cam.R, in radians about the
+        world's axes. This is also ROS's order and frame.
+    statistics : Statistics
+        How it came about.
+    """
+
+    cam_from_world: Rigid3
+    covariance: NDArray[np.float64]
+    statistics: Statistics
+
+
+@dataclass(frozen=True, eq=False)
+class Lost:
+    """No pose, and why."""
+
+    reason: Reason
+    statistics: Statistics
+    detail: str = ""
+
+
+Result = Localized | Lost

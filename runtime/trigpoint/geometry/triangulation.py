@@ -1,0 +1,227 @@
+"""N-view triangulation of latent points (paper, E1 and Proposition 2), batched over points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trigpoint.geometry.epipolar import homogeneous
+from trigpoint.rigid import Rigid3, rotate
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Observations of points in views, in the order of the points.
+
+    Parameters
+    ----------
+    point : (P,) int
+        Which point, rising; the points that occur need not be consecutive.
+    view : (P,) int
+        Which view.
+    xy : (P, 2) float64
+        Where, in normalised image coordinates.
+    """
+
+    point: Index
+    view: Index
+    xy: Array
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def __getitem__(self, index: NDArray[np.generic]) -> Tracks:
+        return Tracks(self.point[index], self.view[index], self.xy[index])
+
+    def groups(self) -> tuple[Index, Index]:
+        """Return the points that occur (M,) and where each one's observations start (M,)."""
+        points, starts = np.unique(self.point, return_index=True)
+        return points, starts
+
+    def of_length(self, min_length: int) -> Tracks:
+        """Keep the points with at least so many observations."""
+        _, starts = self.groups()
+        lengths = np.diff(starts, append=len(self))
+        return self[np.repeat(lengths >= min_length, lengths)]
+
+
+@dataclass(frozen=True, eq=False)
+class LatentPoints:
+    """Triangulated points.
+
+    Parameters
+    ----------
+    point : (M,) int
+        Which points of the tracks.
+    points3d : (M, 3) float64
+        In the world.
+    covariance : (M, 3, 3) float64
+        For observations with unit variance; scale by the variance of the image noise.
+    tracks : Tracks
+        The observations they agree with, two at least for each.
+    """
+
+    point: Index
+    points3d: Array
+    covariance: Array
+    tracks: Tracks
+
+
+def intersect_rays(views_from_world: Rigid3, tracks: Tracks) -> Array:
+    """Points (M, 3) nearest to all their rays: a linear first estimate.
+
+    For each point the solution of sum (I - d d^T) X = sum (I - d d^T) c, as in Proposition 1. Rays
+    that are nearly parallel give a point far away, not an error.
+    """
+    _, starts = tracks.groups()
+    R = views_from_world.R[tracks.view]
+    d = rotate(np.swapaxes(R, 1, 2), homogeneous(tracks.xy))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    c = views_from_world.center[tracks.view]
+    normal = np.eye(3) - d[:, :, None] * d[:, None, :]
+    A = np.add.reduceat(normal, starts)
+    b = np.add.reduceat(rotate(normal, c), starts)
+    # Parallel rays leave A singular along themselves: a tiny pull to the mean center settles it.
+    pull = 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None]
+    mean = np.add.reduceat(c, starts) / np.diff(starts, append=len(tracks))[:, None]
+    solution: Array = np.linalg.solve(
+        A + pull[:, :, None] * np.eye(3), (b + pull * mean)[:, :, None]
+    )[:, :, 0]
+    return solution
+
+
+def project_tracks(
+    views_from_world: Rigid3, tracks: Tracks, points3d: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Residuals and Jacobians of every observation.
+
+    Parameters
+    ----------
+    views_from_world : Rigid3
+        The views (V,).
+    tracks : Tracks
+        P observations of M points.
+    points3d : (M, 3) float64
+        In the order of `tracks.groups()`.
+
+    Returns
+    -------
+    residuals : (P, 2) float64
+        Projection minus observation.
+    jacobians : (P, 2, 3) float64
+        Of the projection by the point.
+    in_front : (P,) bool
+    """
+    _, starts = tracks.groups()
+    X = np.repeat(points3d, np.diff(starts, append=len(tracks)), axis=0)
+    R = views_from_world.R[tracks.view]
+    Y = rotate(R, X) + views_from_world.t[tracks.view]
+    in_front = Y[:, 2] > 0
+    z = np.where(in_front, Y[:, 2], 1.0)
+    xy = Y[:, :2] / z[:, None]
+    jacobians = (R[:, :2] - xy[:, :, None] * R[:, 2:]) / z[:, None, None]
+    return xy - tracks.xy, jacobians, in_front
+
+
+def triangulate(
+    views_from_world: Rigid3, tracks: Tracks, *, num_iterations: int = 5
+) -> tuple[Array, Array]:
+    """Triangulate every point from all its observations.
+
+    Minimises E1 (paper, eq. 14): the sum of squared distances, in the image, of a point's
+    projections from its observations. That is the objective of Proposition 2, which writes it in
+    the first view's point and depth: the third term of its sum must read rho^2 |g|^2 where the
+    paper prints rho |g|^2, since |rho R g + T|^2 = rho^2 |g|^2 + |T|^2 + 2 rho g^T R^T T. Over
+    X in the world it is the same minimum without singling out a view. Gauss-Newton from
+    `intersect_rays`, a step is kept where it lowers the point's cost, else it is halved.
+
+    Parameters
+    ----------
+    views_from_world : Rigid3
+        Poses of the views (V,).
+    tracks : Tracks
+        P observations of M points, each with two at least.
+    num_iterations : int
+        Gauss-Newton steps.
+
+    Returns
+    -------
+    points3d : (M, 3) float64
+        In the order of `tracks.groups()`; for parallel rays some far point.
+    covariance : (M, 3, 3) float64
+        Inverse of the normal matrix: the covariance for unit image noise. Huge, never infinite,
+        where the rays are near parallel.
+    """
+    _, starts = tracks.groups()
+    X = intersect_rays(views_from_world, tracks)
+
+    def evaluate(X: Array) -> tuple[Array, Array, Array]:
+        r, J, in_front = project_tracks(views_from_world, tracks, X)
+        squares = np.where(in_front, (r**2).sum(axis=1), 1e6)
+        J = np.where(in_front[:, None, None], J, 0.0)
+        H = np.add.reduceat(np.swapaxes(J, 1, 2) @ J, starts)
+        g = np.add.reduceat((np.swapaxes(J, 1, 2) @ r[:, :, None])[:, :, 0], starts)
+        return np.add.reduceat(squares, starts), H, g
+
+    def regular(H: Array) -> Array:
+        # Parallel rays: the point may lie anywhere up to a thousand times its distance.
+        floor = 1e-12 * np.trace(H, axis1=1, axis2=2) + np.finfo(float).tiny
+        return H + floor[:, None, None] * np.eye(3)
+
+    cost, H, g = evaluate(X)
+    size = np.ones(len(X))
+    for _ in range(num_iterations):
+        step = np.linalg.solve(regular(H), g[:, :, None])[:, :, 0]
+        candidate = X - size[:, None] * step
+        new_cost, new_H, new_g = evaluate(candidate)
+        better = new_cost <= cost
+        X = np.where(better[:, None], candidate, X)
+        H = np.where(better[:, None, None], new_H, H)
+        g = np.where(better[:, None], new_g, g)
+        cost = np.minimum(cost, new_cost)
+        size = np.where(better, 1.0, size / 2)
+    return X, np.linalg.inv(regular(H))
+
+
+def triangulate_robust(
+    views_from_world: Rigid3, tracks: Tracks, *, max_error: float
+) -> LatentPoints:
+    """Triangulate points whose observations may be wrong.
+
+    The worst observation of a point is dropped, and the point triangulated again, while any is
+    farther than `max_error` (units of the observations) from its projection, or behind its view. A
+    point ends with at least two observations or not at all.
+    """
+    active = tracks.of_length(2)
+    settled: list[Tracks] = []
+    while len(active):
+        _, starts = active.groups()
+        lengths = np.diff(starts, append=len(active))
+        X = intersect_rays(views_from_world, active)
+        r, _, in_front = project_tracks(views_from_world, active, X)
+        errors = np.where(in_front, np.sqrt((r**2).sum(axis=1)), np.inf)
+        worst = np.maximum.reduceat(errors, starts)
+        done = np.repeat(worst <= max_error, lengths)
+        settled.append(active[done])
+        is_worst = errors == np.repeat(worst, lengths)
+        active = active[~done & ~is_worst].of_length(2)
+    kept = _concatenate(settled)
+    points3d, covariance = triangulate(views_from_world, kept)
+    return LatentPoints(kept.groups()[0], points3d, covariance, kept)
+
+
+def _concatenate(parts: list[Tracks]) -> Tracks:
+    if not parts:
+        return Tracks(np.empty(0, np.intp), np.empty(0, np.intp), np.empty((0, 2)))
+    point = np.concatenate([part.point for part in parts])
+    order = np.argsort(point, kind="stable")
+    return Tracks(
+        point[order],
+        np.concatenate([part.view for part in parts])[order],
+        np.concatenate([part.xy for part in parts])[order],
+    )
