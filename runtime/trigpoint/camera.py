@@ -28,8 +28,10 @@ PARAMETERS: dict[str, tuple[str, ...]] = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-# Newton steps of cv2.undistortPoints; 40 reach 1e-10 for lenses up to 120 degrees.
-_UNDISTORT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
+# cv2.undistortPoints iterates to a fixed point: a few steps are enough near the axis, some
+# hundred where a strong lens is nearly flat, at the corners of a 115 degree image.
+_UNDISTORT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 400, 1e-12)
+_MAX_ROUND_TRIP_ERROR_PX = 1e-3
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,8 @@ class Camera:
         wanted = (
             ("k1", "k2", "k3", "k4") if self.model == "OPENCV_FISHEYE" else ("k1", "k2", "p1", "p2")
         )
-        return np.array([self._get(name) if name in names else 0.0 for name in wanted])
+        values = [self._get(name) if name in names else 0.0 for name in wanted]
+        return np.array(values, dtype=np.float64)
 
     def normalize(self, points_px: NDArray[np.floating]) -> Array:
         """Undistort pixels (N, 2) into normalised image coordinates (N, 2) on the plane z = 1.
@@ -146,13 +149,16 @@ class Camera:
             return np.empty((0, 2))
         if self.model == "OPENCV_FISHEYE":
             out = cv2.fisheye.undistortPoints(points, self.K, self.distortion)
-            out = np.where(np.abs(out) > 1e5, np.nan, out)
         elif self.distortion.any():
             out = cv2.undistortPoints(points, self.K, self.distortion, criteria=_UNDISTORT)
         else:
             fx, fy = self.focals_px
             out = (points - (self._get("cx"), self._get("cy"))) / (fx, fy)
-        return np.asarray(out, dtype=np.float64).reshape(-1, 2)
+        normalized = np.asarray(out, dtype=np.float64).reshape(-1, 2)
+        # Outside the model's range OpenCV returns a point all the same, one of another pixel.
+        back = self.project(np.column_stack([normalized, np.ones(len(normalized))]))
+        error_px = np.abs(back - points[:, 0]).max(axis=1)
+        return np.where(error_px[:, None] < _MAX_ROUND_TRIP_ERROR_PX, normalized, np.nan)
 
     def project(self, points_cam: Array) -> Array:
         """Project points (N, 3) in the camera's frame to pixels (N, 2); nan behind the camera."""

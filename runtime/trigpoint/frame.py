@@ -100,7 +100,7 @@ class Statistics:
     num_features: int = 0
     num_anchors: int = 0  # retrieved
     num_matches: int = 0  # over all anchors
-    num_relative_poses: int = 0  # anchors that agree in stage 1
+    num_consistent_anchors: int = 0  # that agree in stage 1
     num_points: int = 0  # latent points
     num_inliers: int = 0  # latent points that agree with the final pose
     generator: str = ""  # which hypothesis was refined: "anchor_pairs" or "latent_points"

@@ -1,58 +1,177 @@
 """Frame in, pose out: the paper's pipeline, top to bottom.
 
-A pure function of the frame, the map's snapshot and the options; the clock is the caller's.
+A pure function of the frame, the map's snapshot and the options. It has no clock of its own: stage
+times are measured with the caller's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trigpoint.frame import (
-    Anchor,
-    Frame,
-    LocalFeatures,
-    Localized,
-    Lost,
-    Reason,
-    Result,
-    Statistics,
-)
-from trigpoint.geometry.absolute_pose import estimate_absolute_pose
-from trigpoint.geometry.epipolar import essential_matrix, sampson_error
-from trigpoint.geometry.pose_refinement import RefinedPose, refine_pose, reprojection
-from trigpoint.geometry.triangulation import LatentPoints, Tracks, triangulate_robust
+from trigpoint.errors import ConfigError
+from trigpoint.frame import Anchor, Frame, Localized, Lost, Reason, Result, Statistics
+from trigpoint.geometry.triangulation import triangulate_robust
 from trigpoint.models.features import FeatureModel
-from trigpoint.models.matching import match_mutual
 from trigpoint.rigid import Rigid3
+from trigpoint.stages import (
+    LocalizerOptions,
+    average_poses,
+    count_support,
+    estimate_relative_poses,
+    judge,
+    match_anchors,
+    refine,
+    solve_latent_points,
+)
 
-Array = NDArray[np.float64]
+MIN_CONTRAST = 2.0  # standard deviation of the gray levels
 
 
 class Map(Protocol):
-    """What the localizer asks of a map."""
+    """What the localizer asks of a map; `trigpoint.database.reader.MapReader` is one."""
 
-    def __len__(self) -> int: ...
+    def __len__(self) -> int:
+        """Count the images."""
+        ...
 
     def search(
         self, global_descriptor: NDArray[np.float32], k: int
-    ) -> tuple[NDArray[np.intp], NDArray[np.float32]]: ...
+    ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """Return the k most similar images, indices and similarities, best first."""
+        ...
 
-    def anchor(self, index: int) -> Anchor: ...
+    def anchor(self, index: int) -> Anchor:
+        """Return an image."""
+        ...
 
 
-@dataclass(frozen=True)
-class LocalizerOptions:
-    num_anchors: int = 20
-    max_keypoints: int = 1024
-    num_relative_poses: int = 8
-    max_epipolar_error_px: float = 2.0
-    max_ray_error_px: float = 3.0
-    max_reprojection_error_px: float = 4.0
-    sigma_px: float = 1.0
-    rounds: int = 2
+class Localizer:
+    """Localizes frames against one snapshot of a map.
+
+    Parameters
+    ----------
+    model : FeatureModel
+        The network the map was made with.
+    map_ : Map
+        Images with features and poses.
+    options : LocalizerOptions, optional
+    clock : callable, optional
+        Seconds, monotonic; without it the results have no stage times.
+    """
+
+    def __init__(
+        self,
+        model: FeatureModel,
+        map_: Map,
+        options: LocalizerOptions | None = None,
+        clock: Callable[[], float] | None = None,
+    ) -> None:
+        self.model = model
+        self.map = map_
+        self.options = options or LocalizerOptions()
+        self.clock = clock
+
+    def localize(self, frame: Frame) -> Result:
+        """Estimate cam_from_world of a frame, with covariance, or say why not."""
+        options, trace = self.options, _Trace(self.clock)
+        _check_size(frame)
+        if len(self.map) == 0:
+            return trace.lost(Reason.NO_MAP, "the map holds no image")
+        if (contrast := float(frame.image.std())) < MIN_CONTRAST:
+            return trace.lost(Reason.TOO_DARK, f"contrast {contrast:.1f} gray levels")
+
+        with trace.stage("features"):
+            features = self.model.extract(frame.image, options.max_keypoints)
+        trace.note(num_features=len(features))
+        if len(features) < options.min_features:
+            return trace.lost(Reason.FEW_FEATURES, f"{len(features)} keypoints")
+
+        with trace.stage("retrieval"):
+            indices, _ = self.map.search(features.global_descriptor, options.num_anchors)
+            anchors = [self.map.anchor(int(index)) for index in indices]
+        trace.note(num_anchors=len(anchors), anchors=tuple(anchor.name for anchor in anchors))
+
+        with trace.stage("matching"):
+            query = match_anchors(frame, features, anchors, self.model.contract.long_side_px)
+        trace.note(num_matches=len(query.tracks))
+
+        with trace.stage("latent_points"):
+            latent = triangulate_robust(
+                query.views, query.tracks, max_error=options.max_ray_error_px * query.px
+            )
+        trace.note(num_points=len(latent.point))
+        if len(latent.point) < options.min_inliers:
+            return trace.lost(Reason.FEW_MATCHES, f"{len(latent.point)} points in two anchors")
+
+        hypotheses: list[tuple[int, str, Rigid3]] = []  # supporters, generator, cam_from_world
+        refusal = Reason.FEW_INLIERS
+        if options.generator != "anchor_pairs":
+            with trace.stage("absolute_pose"):
+                solved = solve_latent_points(query, latent, options)
+                if solved is not None:
+                    support = count_support(query, latent, solved, options)
+                    hypotheses.append((support, "latent_points", solved))
+        if options.generator == "anchor_pairs" or (
+            options.generator == "best"
+            and (not hypotheses or hypotheses[0][0] < options.min_support)
+        ):
+            with trace.stage("relative_poses"):
+                chosen, query_from_anchors = estimate_relative_poses(query, options)
+            with trace.stage("averaging"):
+                averaged = average_poses(query.views[chosen], query_from_anchors, options)
+                if isinstance(averaged, Reason):
+                    refusal = averaged
+                else:
+                    support = count_support(query, latent, averaged[0], options)
+                    hypotheses.append((support, "anchor_pairs", averaged[0]))
+                    trace.note(num_consistent_anchors=averaged[1])
+        if not hypotheses:
+            return trace.lost(refusal, "no hypothesis of the pose")
+
+        with trace.stage("refinement"):
+            _, generator, hypothesis = max(hypotheses, key=lambda hypothesis: hypothesis[0])
+            latent, refined = refine(query, hypothesis, options)
+        trace.note(generator=generator, num_points=len(latent.point))
+        if refined is None:
+            return trace.lost(Reason.FEW_INLIERS, "the latent points do not determine a pose")
+        trace.note(num_inliers=int(refined.inliers.sum()))
+        objection = judge(latent, refined, options)
+        if objection is not None:
+            return trace.lost(*objection)
+        return Localized(refined.cam_from_world, refined.covariance, trace.statistics)
+
+
+class _Trace:
+    """What is known of a localization so far."""
+
+    def __init__(self, clock: Callable[[], float] | None) -> None:
+        self.clock = clock
+        self.statistics = Statistics()
+
+    def note(self, **values: Any) -> None:
+        self.statistics = replace(self.statistics, **values)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = self.clock() if self.clock else 0.0
+        yield
+        if self.clock:
+            self.statistics.stage_ms[name] = (self.clock() - start) * 1e3
+
+    def lost(self, reason: Reason, detail: str) -> Lost:
+        return Lost(reason, self.statistics, detail)
+
+
+def _check_size(frame: Frame) -> None:
+    height, width = frame.image.shape
+    if (width, height) != (frame.camera.width, frame.camera.height):
+        raise ConfigError(
+            f"frame {frame.name!r} has {width} x {height} px, its camera "
+            f"{frame.camera.width} x {frame.camera.height}: calibrate for this size"
+        )

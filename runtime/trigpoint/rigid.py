@@ -140,6 +140,7 @@ def rotation_from_vector(rotvec: Array) -> Array:
 
 def rotation_angle(R: Array) -> Array:
     """Angles (...) in radians of rotation matrices (..., 3, 3), accurate at 0 and at pi."""
-    chord = np.linalg.norm(R - np.eye(3), axis=(-2, -1)) / np.sqrt(8.0)
-    angle: Array = 2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))
+    axis = R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]]  # of length 2 sin(angle)
+    cosine = (np.trace(R, axis1=-2, axis2=-1) - 1.0) / 2.0
+    angle: Array = np.arctan2(np.linalg.norm(axis, axis=-1) / 2.0, cosine)
     return angle

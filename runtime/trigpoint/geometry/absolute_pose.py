@@ -9,8 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trigpoint.geometry.relative_pose import Backend, poselib
+from trigpoint.geometry.relative_pose import Backend
 from trigpoint.rigid import Rigid3
+
+try:
+    import poselib
+except ImportError:  # no wheel for this machine
+    poselib = None
 
 Array = NDArray[np.float64]
 

@@ -169,9 +169,10 @@ def triangulate(
         return np.add.reduceat(squares, starts), H, g
 
     def regular(H: Array) -> Array:
-        # Parallel rays: the point may lie anywhere up to a thousand times its distance.
+        # Parallel rays leave H singular: the point may then lie anywhere along them.
         floor = 1e-12 * np.trace(H, axis1=1, axis2=2) + np.finfo(float).tiny
-        return H + floor[:, None, None] * np.eye(3)
+        regular: Array = H + floor[:, None, None] * np.eye(3)
+        return regular
 
     cost, H, g = evaluate(X)
     size = np.ones(len(X))
@@ -185,7 +186,8 @@ def triangulate(
         g = np.where(better[:, None], new_g, g)
         cost = np.minimum(cost, new_cost)
         size = np.where(better, 1.0, size / 2)
-    return X, np.linalg.inv(regular(H))
+    covariance: Array = np.linalg.inv(regular(H))
+    return X, covariance
 
 
 def triangulate_robust(

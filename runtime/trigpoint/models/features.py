@@ -69,7 +69,7 @@ class FeatureModel:
         dense = np.ascontiguousarray(desc[0].reshape(dim, -1).T)
         scale = np.array([columns / small.shape[1], rows / small.shape[0]], dtype=np.float32)
         local = sample_bilinear(dense.reshape(rows, columns, dim), (points + 0.5) * scale - 0.5)
-        zoom = np.array(image.shape[::-1], np.float32) / np.array(small.shape[::-1], np.float32)
+        zoom: Array32 = np.divide(image.shape[::-1], small.shape[::-1]).astype(np.float32)
         return LocalFeatures(
             keypoints=(points + 0.5) * zoom - 0.5,
             descriptors=self.vocabulary.center(local),

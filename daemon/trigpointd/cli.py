@@ -1,0 +1,146 @@
+"""The command `trigpointd`."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from trigpoint.errors import TrigpointError
+from trigpoint.poses import format_pose
+from trigpointd.config import Config, LogConfig, SourceConfig, ZenohConfig, load_config
+from trigpointd.service import open_pipeline, open_source, run
+from trigpointd.sinks.base import Sink
+from trigpointd.sinks.poses import PoseFile
+from trigpointd.watch import Received, subscribe
+
+app = typer.Typer(
+    help="Trigpoint: where is this camera, from its pictures and a map.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback()
+def _set_up(
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")] = False,
+) -> None:
+    logging.basicConfig(
+        level=logging.DEBUG if verbose else logging.INFO,
+        format="trigpointd: %(message)s",
+        stream=sys.stderr,
+    )
+
+
+@app.command("run")
+def run_command(
+    config: Annotated[Path, typer.Option(help="Settings, a TOML file.")],
+) -> None:
+    """Localize frames and publish poses, until the recording ends or SIGTERM comes."""
+    totals = run(load_config(config))
+    logging.getLogger(__name__).info("%s", totals)
+
+
+@app.command()
+def check_config(config: Annotated[Path, typer.Argument(help="Settings, a TOML file.")]) -> None:
+    """Check the settings, and open all that they name."""
+    settings = load_config(config)
+    with open_pipeline(settings):
+        open_source(settings)
+    print(f"{config}: good")
+
+
+@app.command()
+def replay(
+    recording: Annotated[Path, typer.Argument(help="An MCAP recording, or a log.")],
+    map_: Annotated[Path, typer.Option("--map", help="The map.")],
+    log: Annotated[Path | None, typer.Option(help="Write an MCAP log.")] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="Write `time_ns qw qx qy qz tx ty tz`, cam_from_world.")
+    ] = None,
+    topic: Annotated[str | None, typer.Option(help="The images' topic.")] = None,
+) -> None:
+    """Localize every frame of a recording, as fast as it goes."""
+    config = Config(
+        map=map_,
+        source=SourceConfig(type="mcap", path=recording, image_topic=topic),
+        log=None if log is None else LogConfig(path=log),
+    )
+    sinks: list[Sink] = [] if poses is None else [PoseFile(poses)]
+    totals = run(config, sinks)
+    print(f"{recording}: {totals}")
+
+
+@app.command()
+def watch(
+    key: Annotated[str, typer.Option(help="Which poses.")] = "trigpoint/**/pose",
+    connect: Annotated[list[str] | None, typer.Option(help="Endpoint to connect to.")] = None,
+    listen: Annotated[list[str] | None, typer.Option(help="Endpoint to listen on.")] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="Write `time_ns qw qx qy qz tx ty tz`, body_from_world.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON lines.")] = False,
+    exit_with_daemon: Annotated[
+        bool, typer.Option("--exit-with-daemon", help="End when the daemon leaves.")
+    ] = False,
+) -> None:
+    """Print poses as they come over Zenoh, in their world frame."""
+    endpoints = [*(connect or ()), *(listen or ())]
+    config = ZenohConfig(
+        connect=tuple(connect or ()),
+        listen=tuple(listen or ()),
+        multicast_scouting=not endpoints,
+    )
+    with ExitStack() as stack:
+        file = None if poses is None else stack.enter_context(poses.open("w", buffering=1))
+        for received in subscribe(config, key, exit_with_daemon=exit_with_daemon):
+            if isinstance(received, str):
+                print(f"trigpointd: {received}", file=sys.stderr)
+                continue
+            print(_format_json(received) if as_json else _format(received), flush=True)
+            if file is not None:
+                pose = received.pose
+                file.write(format_pose(str(pose.time_ns), pose.world_from_body.inverse()))
+
+
+def _format(received: Received) -> str:
+    pose = received.pose
+    std_m = np.sqrt(np.diag(pose.covariance)[:3])
+    x, y, z = pose.world_from_body.t
+    w, qx, qy, qz = pose.world_from_body.quaternion
+    return (
+        f"{pose.time_ns / 1e9:.3f} {received.key}  {x:+8.3f} {y:+8.3f} {z:+8.3f} m "
+        f"(std {np.linalg.norm(std_m) * 1e3:.1f} mm)  "
+        f"wxyz {w:+.4f} {qx:+.4f} {qy:+.4f} {qz:+.4f}"
+    )
+
+
+def _format_json(received: Received) -> str:
+    pose = received.pose
+    return json.dumps(
+        {
+            "key": received.key,
+            "time_ns": pose.time_ns,
+            "frame_id": pose.frame_id,
+            "position_m": pose.world_from_body.t.tolist(),
+            "rotation_wxyz": pose.world_from_body.quaternion.tolist(),
+            "covariance": pose.covariance.ravel().tolist(),
+        }
+    )
+
+
+def main() -> None:
+    """Run the command; an error is one line and exit code 1."""
+    try:
+        app()
+    except TrigpointError as error:
+        sys.exit(f"trigpointd: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)

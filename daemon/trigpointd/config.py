@@ -1,0 +1,149 @@
+"""The daemon's settings: one strict TOML file."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from trigpoint.errors import ConfigError
+from trigpoint.rigid import Rigid3
+from trigpoint.stages import LocalizerOptions
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+S = TypeVar("S", bound="Section")
+
+
+class Section(BaseModel):
+    """A table of the file; a key it does not know is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class SourceConfig(Section):
+    """Where frames come from."""
+
+    type: Literal["mcap"]
+    path: Path
+    image_topic: str | None = None  # needed where the recording has several
+    rate: Annotated[float, Field(gt=0)] | None = None  # of the recorded pace; without: at once
+
+
+class CameraConfig(Section):
+    """Where the camera sits on the body."""
+
+    position_m: Vector3 = (0.0, 0.0, 0.0)  # in the body's frame
+    rotation_wxyz: Quaternion = (1.0, 0.0, 0.0, 0.0)  # body_from_camera
+
+    @field_validator("rotation_wxyz")
+    @classmethod
+    def _unit(cls, wxyz: Quaternion) -> Quaternion:
+        if abs(np.linalg.norm(wxyz) - 1) > 0.01:
+            raise ValueError("must be a unit quaternion, w first")
+        return wxyz
+
+    @property
+    def body_from_camera(self) -> Rigid3:
+        """The extrinsics; in a camera's frame x is right, y down, z ahead."""
+        return Rigid3.from_quaternion(self.rotation_wxyz, self.position_m)
+
+
+class ModelConfig(Section):
+    """Which network, and how it runs."""
+
+    path: Path | None = None  # the packaged one by default
+    num_threads: Annotated[int, Field(ge=1, le=64)] = 2
+
+
+class ZenohConfig(Section):
+    """How to reach subscribers."""
+
+    mode: Literal["peer", "client"] = "peer"
+    listen: tuple[str, ...] = ()  # endpoints, such as "tcp/127.0.0.1:7447"
+    connect: tuple[str, ...] = ()
+    multicast_scouting: bool = True
+    wait_for_subscriber_s: Annotated[float, Field(ge=0)] = 0.0  # before the first frame
+
+
+class LogConfig(Section):
+    """The MCAP log."""
+
+    path: Path
+    frames: bool = True  # input images too, so that the log can be replayed
+    overwrite: bool = False
+
+
+class Config(Section):
+    """All settings of `trigpointd run`."""
+
+    map: Path
+    base_key: Annotated[str, Field(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] = "trigpoint/device"
+    map_frame: str = "map"  # frame_id of the poses
+    source: SourceConfig
+    camera: CameraConfig = CameraConfig()
+    model: ModelConfig = ModelConfig()
+    localizer: LocalizerOptions = LocalizerOptions()
+    zenoh: ZenohConfig | None = None  # without the table nothing is published
+    log: LogConfig | None = None
+
+
+def load_config(path: Path) -> Config:
+    """Read and check the file; relative paths in it are relative to its folder."""
+    try:
+        tables = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path} is not TOML: {error}") from error
+    try:
+        config = Config.model_validate(tables)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_explain(error)}") from error
+    except ConfigError as error:  # from LocalizerOptions
+        raise ConfigError(f"{path}: localizer: {error}") from error
+    return _resolve(config, path.parent)
+
+
+def _resolve(section: S, folder: Path) -> S:
+    """Make the paths of a section, and of those within, relative to a folder."""
+    changes: dict[str, Any] = {}
+    for name, value in section:
+        if isinstance(value, Path):
+            changes[name] = folder / value
+        elif isinstance(value, Section):
+            changes[name] = _resolve(value, folder)
+    return section.model_copy(update=changes)
+
+
+def _explain(error: ValidationError) -> str:
+    """Put the first thing that is wrong in one line; for an unknown key, name the nearest one."""
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        known = _keys(first["loc"][:-1])
+        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1, cutoff=0.0)
+        return f"unknown key {where!r}; did you mean {near[0]!r}?"
+    if first["type"] == "missing":
+        return f"{where!r} is missing"
+    return f"{where!r}: {first['msg']} (it is {first['input']!r})"
+
+
+def _keys(loc: tuple[int | str, ...]) -> list[str]:
+    """List the keys of the table at a place in the file."""
+    if loc == ("localizer",):
+        return [field.name for field in dataclasses.fields(LocalizerOptions)]
+    sections: dict[str, type[Section]] = {
+        "source": SourceConfig,
+        "camera": CameraConfig,
+        "model": ModelConfig,
+        "zenoh": ZenohConfig,
+        "log": LogConfig,
+    }
+    section = sections[str(loc[0])] if loc else Config
+    return list(section.model_fields)

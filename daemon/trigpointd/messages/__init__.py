@@ -1,0 +1,1 @@
+"""What goes over the wire and into files: bytes in, core types out, and back."""

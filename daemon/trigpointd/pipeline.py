@@ -1,0 +1,106 @@
+"""From a captured frame to what is published of it; no sockets, no tasks, no waiting."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from trigpoint.errors import DatabaseError
+from trigpoint.frame import Frame, Localized, Lost, Result
+from trigpoint.localizer import Localizer
+from trigpoint.rigid import Rigid3
+from trigpointd.messages.cdr import encode_pose
+from trigpointd.messages.pose import body_pose
+from trigpointd.sources.base import BadFrame, Captured
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A frame that could not be worked on: BAD_FRAME or BAD_MAP."""
+
+    reason: str
+    detail: str
+
+
+@dataclass(frozen=True, eq=False)
+class Output:
+    """What sinks get for each frame.
+
+    `pose` is a PoseWithCovarianceStamped of world_from_body in CDR, None unless localized; `status`
+    is a JSON object, one for every frame; `outcome` is the reason where there is no pose.
+    """
+
+    captured: Captured
+    result: Result | Failure
+    pose: bytes | None
+    status: bytes
+
+    @property
+    def outcome(self) -> str:
+        """In a word, what came of the frame."""
+        return "LOCALIZED" if isinstance(self.result, Localized) else self.result.reason
+
+    @property
+    def time_ns(self) -> int:
+        """Capture time."""
+        return self.captured.frame.time_ns
+
+
+class Pipeline:
+    """Localizes captured frames and writes the messages about them."""
+
+    def __init__(self, localizer: Localizer, body_from_camera: Rigid3, map_frame: str) -> None:
+        self._localizer = localizer
+        self._body_from_camera = body_from_camera
+        self._map_frame = map_frame
+
+    def process(self, captured: Captured, num_dropped: int) -> Output:
+        """Localize one frame; `num_dropped` is how many the slot has dropped so far."""
+        start_s = time.perf_counter()
+        frame = captured.frame
+        result = self._localize(frame)
+        pose = None
+        if isinstance(result, Localized):
+            world_from_body, covariance = body_pose(
+                result.cam_from_world, result.covariance, self._body_from_camera
+            )
+            pose = encode_pose(frame.time_ns, self._map_frame, world_from_body, covariance)
+        status = {
+            "time_ns": frame.time_ns,
+            "frame": frame.name,
+            **describe(result),
+            "latency_ms": round((time.perf_counter() - start_s) * 1e3, 3),
+            "num_dropped": num_dropped,
+        }
+        return Output(captured, result, pose, json.dumps(status).encode())
+
+
+    def _localize(self, frame: Frame | BadFrame) -> Result | Failure:
+        if isinstance(frame, BadFrame):
+            return Failure("BAD_FRAME", frame.detail)
+        try:
+            return self._localizer.localize(frame)
+        except DatabaseError as error:  # a damaged image; frames elsewhere can do without it
+            return Failure("BAD_MAP", str(error))
+
+
+def describe(result: Result | Failure) -> dict[str, Any]:
+    """Say in JSON's types what came of a frame."""
+    if isinstance(result, Failure):
+        return {"status": "FAILED", "reason": result.reason, "detail": result.detail}
+    counts = dataclasses.asdict(result.statistics)
+    counts["stage_ms"] = {k: round(v, 3) for k, v in result.statistics.stage_ms.items()}
+    if isinstance(result, Lost):
+        return {"status": "LOST", "reason": result.reason, "detail": result.detail, **counts}
+    std = np.sqrt(np.diag(result.covariance))
+    return {
+        "status": "LOCALIZED",
+        "position_std_m": float(np.linalg.norm(std[:3])),
+        "rotation_std_deg": float(np.rad2deg(np.linalg.norm(std[3:]))),
+        **counts,
+    }

@@ -1,0 +1,60 @@
+"""A subscriber: the poses of a daemon, as they come."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import zenoh
+
+from trigpoint.errors import SourceError
+from trigpointd.config import ZenohConfig
+from trigpointd.messages.cdr import PoseStamped, decode_pose
+from trigpointd.sinks.zenoh import open_session
+
+
+@dataclass(frozen=True)
+class Received:
+    """A pose and the key it came on."""
+
+    key: str
+    pose: PoseStamped
+
+
+def subscribe(
+    config: ZenohConfig, key: str, *, exit_with_daemon: bool = False
+) -> Iterator[Received | str]:
+    """Yield poses as they come, and a message that is no pose as a text that says so.
+
+    Parameters
+    ----------
+    config : ZenohConfig
+        How to reach the network.
+    key : str
+        Key expression, such as `trigpoint/**/pose`.
+    exit_with_daemon : bool
+        End when a daemon that publishes on the key has left.
+    """
+    inbox: queue.SimpleQueue[zenoh.Sample | None] = queue.SimpleQueue()
+
+    def daemon_changed(sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE:
+            inbox.put(None)
+
+    with open_session(config) as session:
+        # The token is undeclared after the last pose, on the same session: it cannot overtake.
+        alive = key.removesuffix("/pose") + "/alive"
+        session.declare_subscriber(key, inbox.put)
+        if exit_with_daemon:
+            session.liveliness().declare_subscriber(alive, daemon_changed, history=True)
+        while (sample := inbox.get()) is not None:
+            yield _decode(sample)
+
+
+def _decode(sample: zenoh.Sample) -> Received | str:
+    key = str(sample.key_expr)
+    try:
+        return Received(key, decode_pose(sample.payload.to_bytes()))
+    except SourceError as error:
+        return f"{key}: {error}"

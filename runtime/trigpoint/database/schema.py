@@ -1,0 +1,232 @@
+r"""How a map lies on disk: the only place that knows bytes.
+
+A map is one LMDB file (data format of LMDB 0.9, 64 bit). Numbers are little-endian, in keys
+big-endian so that they sort. Each value begins with the CRC-32 of its key and of all that follows:
+neither an altered byte nor a value under a wrong key goes unnoticed.
+
+    key                        value after the CRC
+    00                         metadata, JSON
+    01 name                    index of the image, u32
+    02 block u32               up to 256 retrieval rows: scales (n,) f4, rows (n, G) i1
+    03 index u32 00            an image: pose, camera, sizes, its first keypoints, name
+    03 index u32 01            its features: other keypoints (N - j, 2) u2, descriptors (N, D) i1
+
+Keypoints are fixed point, `x = u step - 0.5` with `step = max(width, height) / 65535` px.
+Descriptors are `i 4 / (127 sqrt(D))`: numbers of a unit vector have a standard deviation of
+1 / sqrt(D). Retrieval rows have a scale each, which makes the stored row a unit vector.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trigpoint.camera import PARAMETERS, Camera
+from trigpoint.database.pages import HEADER_BYTES
+from trigpoint.errors import ConfigError, DatabaseError
+from trigpoint.frame import LocalFeatures, ModelIdentity
+from trigpoint.rigid import Rigid3
+
+Array32 = NDArray[np.float32]
+
+FORMAT = 1
+BLOCK_ROWS = 256
+MAX_NAME_BYTES = 500  # LMDB's keys end at 511
+MAX_KEYPOINTS = 65_535
+
+METADATA_KEY = b"\x00"
+_CRC = struct.Struct("<I")
+_INDEX = struct.Struct("<I")
+_IMAGE = struct.Struct("<7d 8d 24s IIIH")  # pose, parameters, model; sizes, keypoints: all, here
+_MAX_INLINE_BYTES = 1024
+
+
+def name_key(name: str) -> bytes:
+    """Key of the index entry of an image's name."""
+    return b"\x01" + name.encode()
+
+
+def block_key(block: int) -> bytes:
+    """Key of the retrieval rows of images 256 block, 256 block + 1..."""
+    return struct.pack(">BI", 2, block)
+
+
+def image_key(index: int) -> bytes:
+    """Key of an image; sorts last, so that images are appended at the end of the tree."""
+    return struct.pack(">BIB", 3, index, 0)
+
+
+def features_key(index: int) -> bytes:
+    """Key of an image's features; follows the image's."""
+    return struct.pack(">BIB", 3, index, 1)
+
+
+def describe_key(key: bytes) -> str:
+    """Say for people what lies under a key."""
+    if key == METADATA_KEY:
+        return "the map's metadata"
+    if key[0] == 1:
+        return f"the index entry of {key[1:].decode()!r}"
+    number = int.from_bytes(key[1:5], "big")
+    return f"retrieval block {number}" if key[0] == 2 else f"image {number}"
+
+
+def seal(key: bytes, payload: bytes) -> bytes:
+    """Put the checksum before a value."""
+    return _CRC.pack(zlib.crc32(payload, zlib.crc32(key))) + payload
+
+
+def unseal(key: bytes, value: memoryview | None, *, check: bool = True) -> memoryview:
+    """Return what follows the checksum, after comparing it."""
+    if value is None:
+        raise DatabaseError(f"{describe_key(key)} is missing")
+    payload = value[_CRC.size :]
+    if check and value[: _CRC.size] != _CRC.pack(zlib.crc32(payload, zlib.crc32(key))):
+        raise DatabaseError(f"{describe_key(key)} is damaged: its checksum does not match")
+    return payload
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a map says of itself."""
+
+    model: ModelIdentity  # of the network that made the features
+    generation: int = 0  # rises with each commit
+    num_images: int = 0
+
+    def encode(self) -> bytes:
+        """Write JSON."""
+        return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}).encode()
+
+    @classmethod
+    def decode(cls, payload: memoryview) -> Metadata:
+        """Read JSON of this version."""
+        fields = json.loads(bytes(payload))
+        if (found := fields.pop("format")) != FORMAT:
+            raise DatabaseError(
+                f"has format {found}, and this version reads format {FORMAT}; "
+                "rebuild it with `trigpoint-db build`, or use the version that made it"
+            )
+        return cls(**{**fields, "model": ModelIdentity(**fields["model"])})
+
+
+def encode_index(index: int) -> bytes:
+    """Write the index entry of a name."""
+    return _INDEX.pack(index)
+
+
+def decode_index(payload: memoryview) -> int:
+    """Read the index entry of a name."""
+    index: int = _INDEX.unpack(payload)[0]
+    return index
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """An image without its features."""
+
+    name: str
+    camera: Camera
+    cam_from_world: Rigid3
+    num_keypoints: int
+    first_keypoints: NDArray[np.uint16]  # (j, 2), fixed point
+
+
+def encode_image(
+    name: str, camera: Camera, cam_from_world: Rigid3, features: LocalFeatures
+) -> tuple[bytes, bytes]:
+    """Write an image and its features.
+
+    LMDB gives a large value whole pages. Where the features hang over their last page but a little
+    (1024 x 64 are 17 pages and 36 bytes), the first keypoints move to the image, which lies in the
+    tree's own pages.
+    """
+    num_keypoints, dim = features.descriptors.shape
+    step = _keypoint_step_px(camera)
+    keypoints = np.rint((features.keypoints.astype(np.float64) + 0.5) / step).astype("<u2")
+    scaled = features.descriptors / np.float32(_descriptor_step(dim))
+    descriptors = np.clip(np.rint(scaled), -127, 127).astype(np.int8)
+
+    stored = HEADER_BYTES + _CRC.size + keypoints.nbytes + descriptors.nbytes
+    overhang = stored % 4096 if stored > 4096 else 0
+    inline = -(-overhang // 4) if overhang <= _MAX_INLINE_BYTES else 0
+    header = _IMAGE.pack(
+        *cam_from_world.quaternion,
+        *cam_from_world.t,
+        *np.pad(camera.params, (0, 8 - len(camera.params))),
+        camera.model.encode(),
+        camera.width,
+        camera.height,
+        num_keypoints,
+        inline,
+    )
+    return (
+        header + keypoints[:inline].tobytes() + name.encode(),
+        keypoints[inline:].tobytes() + descriptors.tobytes(),
+    )
+
+
+def decode_image(payload: memoryview) -> Image:
+    """Read an image."""
+    *numbers, model, width, height, num_keypoints, inline = _IMAGE.unpack_from(payload)
+    model = model.rstrip(b"\0").decode()
+    params = numbers[7 : 7 + len(PARAMETERS.get(model, ()))]
+    try:
+        camera = Camera(model, width, height, tuple(params))
+    except ConfigError as error:
+        raise DatabaseError(f"an image needs another version of Trigpoint: {error}") from error
+    rest = payload[_IMAGE.size :]
+    return Image(
+        name=bytes(rest[4 * inline :]).decode(),
+        camera=camera,
+        cam_from_world=Rigid3.from_quaternion(numbers[:4], numbers[4:7]),
+        num_keypoints=num_keypoints,
+        first_keypoints=np.frombuffer(rest[: 4 * inline], "<u2").reshape(-1, 2),
+    )
+
+
+def decode_features(image: Image, payload: memoryview, dim: int) -> tuple[Array32, Array32]:
+    """Read keypoints (N, 2) in px and normalised descriptors (N, D)."""
+    split = 4 * (image.num_keypoints - len(image.first_keypoints))
+    others = np.frombuffer(payload[:split], "<u2").reshape(-1, 2)
+    fixed = np.concatenate([image.first_keypoints, others])
+    keypoints = (fixed * _keypoint_step_px(image.camera) - 0.5).astype(np.float32)
+    # The scale of the descriptors cancels in the norm.
+    descriptors = np.frombuffer(payload[split:], np.int8).reshape(-1, dim).astype(np.float32)
+    norms = np.sqrt(np.einsum("ij,ij->i", descriptors, descriptors))
+    descriptors /= np.maximum(norms, np.float32(1))[:, None]
+    return keypoints, descriptors
+
+
+def _keypoint_step_px(camera: Camera) -> float:
+    return max(camera.width, camera.height) / 65_535
+
+
+def _descriptor_step(dim: int) -> float:
+    return 4 / (127 * float(np.sqrt(dim)))
+
+
+def quantize_row(row: Array32) -> tuple[np.float32, NDArray[np.int8]]:
+    """Return the scale and the int8 numbers (G,) of a global descriptor; zero stays zero."""
+    peak = np.abs(row).max()
+    numbers = np.rint(row * np.float32(127 / peak if peak > 0 else 0)).astype(np.int8)
+    norm = np.linalg.norm(numbers.astype(np.float32))
+    return np.float32(1 / norm if norm > 0 else 0), numbers
+
+
+def encode_block(scales: Array32, rows: NDArray[np.int8]) -> bytes:
+    """Write retrieval rows (n, G) and their scales (n,)."""
+    return scales.astype("<f4").tobytes() + rows.tobytes()
+
+
+def decode_block(payload: memoryview, dim: int) -> tuple[Array32, NDArray[np.int8]]:
+    """View retrieval rows (n, G) and their scales (n,) where they lie."""
+    split = len(payload) // (4 + dim) * 4
+    scales = np.frombuffer(payload[:split], "<f4")
+    return scales, np.frombuffer(payload[split:], np.int8).reshape(-1, dim)

@@ -1,0 +1,242 @@
+"""The stages between features and verdict, each a function of the one before.
+
+Image points are undistorted and normalised; thresholds come in px of the image as the network sees
+it and are multiplied by `Query.px`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trigpoint.errors import ConfigError
+from trigpoint.frame import Anchor, Frame, LocalFeatures, Reason
+from trigpoint.geometry.absolute_pose import estimate_absolute_pose
+from trigpoint.geometry.anchor_ransac import NoConsensus, find_consensus
+from trigpoint.geometry.center_averaging import average_centers_robust, center_directions
+from trigpoint.geometry.epipolar import essential_matrix, sampson_error
+from trigpoint.geometry.pose_refinement import RefinedPose, refine_pose, reprojection
+from trigpoint.geometry.relative_pose import estimate_relative_pose
+from trigpoint.geometry.rotation_averaging import average_rotations
+from trigpoint.geometry.triangulation import LatentPoints, Tracks, triangulate_robust
+from trigpoint.models.matching import match_mutual
+from trigpoint.rigid import Rigid3
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class LocalizerOptions:
+    """Settings of the localizer; pixels are those of the image as the network sees it."""
+
+    num_anchors: int = 20
+    max_keypoints: int = 1024
+    # "best": latent points first; anchor pairs too where these have few supporters
+    generator: Literal["best", "anchor_pairs", "latent_points"] = "best"
+    min_support: int = 100  # latent points that make a second hypothesis needless
+    num_relative_poses: int = 8
+    min_relative_inliers: int = 15
+    max_epipolar_error_px: float = 1.5
+    max_direction_error_deg: float = 5.0
+    max_rotation_error_deg: float = 3.0
+    min_ray_angle_deg: float = 1.5
+    max_hypothesis_error_px: float = 3.0
+    max_guided_error_px: float = 2.0
+    max_ray_error_px: float = 2.0
+    max_reprojection_error_px: float = 4.0
+    keypoint_sigma_px: float = 0.4
+    min_features: int = 50
+    min_inliers: int = 30
+    min_inlier_ratio: float = 0.4
+    max_position_std_ratio: float = 0.05  # of the inliers' median depth
+    max_position_std_m: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.num_anchors < 2:
+            raise ConfigError("num_anchors must be at least 2: one anchor does not tell the scale")
+        for name, value in vars(self).items():
+            if isinstance(value, int | float) and value <= 0:
+                raise ConfigError(f"{name} must be positive, not {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """The query's keypoints and their matches in the anchors.
+
+    Parameters
+    ----------
+    points : (N, 2) float64
+        The query's keypoints.
+    px : float
+        The size of a pixel of the network's image.
+    views : Rigid3
+        The anchors' cam_from_world (K,).
+    tracks : Tracks
+        All matches: point is the query's keypoint, view the anchor, xy the place in the anchor.
+    matches : list of (M, 2) int
+        By anchor: query's keypoint, row in `anchor_points`; best first.
+    anchor_points : list of (M, 2) float64
+        By anchor: where its matched keypoints are, in the order of `matches`.
+    """
+
+    points: Array
+    px: float
+    views: Rigid3
+    tracks: Tracks
+    matches: list[Index]
+    anchor_points: list[Array]
+
+
+def match_anchors(
+    frame: Frame, features: LocalFeatures, anchors: Sequence[Anchor], long_side_px: int
+) -> Query:
+    """Match the query's features with each anchor's and normalise what matched."""
+    points = frame.camera.normalize(features.keypoints)
+    seen = np.asarray(np.isfinite(points).all(axis=1))
+    matches: list[Index] = []
+    anchor_points: list[Array] = []
+    for anchor in anchors:
+        pairs, _ = match_mutual(features.descriptors, anchor.descriptors)
+        xy = anchor.camera.normalize(anchor.keypoints[pairs[:, 1]])
+        usable = seen[pairs[:, 0]] & np.isfinite(xy).all(axis=1)
+        matches.append(pairs[usable, 0])
+        anchor_points.append(xy[usable])
+    point = np.concatenate(matches)
+    view = np.repeat(np.arange(len(anchors)), [len(match) for match in matches])
+    order = np.argsort(point, kind="stable")
+    tracks = Tracks(point[order], view[order], np.concatenate(anchor_points)[order])
+    zoom = max(1.0, max(frame.camera.width, frame.camera.height) / long_side_px)
+    return Query(
+        points,
+        zoom / frame.camera.focal_px,
+        Rigid3.stack(anchor.cam_from_world for anchor in anchors),
+        tracks,
+        matches,
+        anchor_points,
+    )
+
+
+def estimate_relative_poses(query: Query, options: LocalizerOptions) -> tuple[Index, Rigid3]:
+    """Relative poses of the query and the anchors with the most matches (paper, section II).
+
+    Returns
+    -------
+    chosen : (C,) int
+        The anchors that gave one, best first.
+    query_from_anchors : Rigid3
+        Their relative poses (C,), with translations of length 1.
+    """
+    by_matches = np.argsort([-len(match) for match in query.matches], kind="stable")
+    chosen, poses = [], []
+    for k in by_matches[: options.num_relative_poses]:
+        pose = estimate_relative_pose(
+            query.anchor_points[k],
+            query.points[query.matches[k]],
+            max_error=options.max_epipolar_error_px * query.px,
+        )
+        if pose is not None and pose.inliers.sum() >= options.min_relative_inliers:
+            chosen.append(k)
+            poses.append(pose.b_from_a)
+    return np.array(chosen, dtype=np.intp), Rigid3.stack(poses)
+
+
+def average_poses(
+    anchors_from_world: Rigid3, query_from_anchors: Rigid3, options: LocalizerOptions
+) -> tuple[Rigid3, int] | Reason:
+    """Stage 1 of the paper: RANSAC over anchor pairs, center averaging, rotation averaging.
+
+    Returns the query's cam_from_world and how many anchors agree on it, or why there is none.
+    """
+    if len(anchors_from_world) < 2:
+        return Reason.FEW_ANCHORS
+    consensus = find_consensus(
+        anchors_from_world,
+        query_from_anchors,
+        max_direction_error_rad=np.deg2rad(options.max_direction_error_deg),
+        max_rotation_error_rad=np.deg2rad(options.max_rotation_error_deg),
+        min_angle_rad=np.deg2rad(options.min_ray_angle_deg),
+    )
+    if consensus is NoConsensus.DEGENERATE:
+        return Reason.DEGENERATE_ANCHORS
+    if isinstance(consensus, NoConsensus):
+        return Reason.FEW_ANCHORS
+    anchors, relative = (
+        anchors_from_world[consensus.inliers],
+        query_from_anchors[consensus.inliers],
+    )
+    center = average_centers_robust(anchors.center, center_directions(anchors, relative))
+    if center is None:
+        return Reason.DEGENERATE_ANCHORS
+    return Rigid3.from_center(average_rotations(relative.R @ anchors.R), center), len(anchors)
+
+
+def solve_latent_points(
+    query: Query, latent: LatentPoints, options: LocalizerOptions
+) -> Rigid3 | None:
+    """Latent points first: the query's pose by P3P in LO-RANSAC, with no relative pose at all."""
+    # The more anchors agree on a point, the likelier it is right: sampled first.
+    _, starts = latent.tracks.groups()
+    order = np.argsort(-np.diff(starts, append=len(latent.tracks)), kind="stable")
+    return estimate_absolute_pose(
+        latent.points3d[order],
+        query.points[latent.point[order]],
+        max_error=options.max_hypothesis_error_px * query.px,
+    )
+
+
+def count_support(
+    query: Query, latent: LatentPoints, cam_from_world: Rigid3, options: LocalizerOptions
+) -> int:
+    """Count latent points that a hypothesis projects onto their keypoints."""
+    residuals, _, _, in_front = reprojection(
+        cam_from_world, latent.points3d, query.points[latent.point]
+    )
+    near = np.linalg.norm(residuals, axis=1) < options.max_hypothesis_error_px * query.px
+    return int((near & in_front).sum())
+
+
+def guide_matches(query: Query, cam_from_world: Rigid3, max_error: float) -> Tracks:
+    """Keep the matches within `max_error` of the epipolar geometry of a hypothesis."""
+    E = essential_matrix(cam_from_world @ query.views.inverse())
+    tracks = query.tracks
+    errors = sampson_error(E[tracks.view], tracks.xy, query.points[tracks.point])
+    return tracks[np.abs(errors) < max_error]
+
+
+def refine(
+    query: Query, cam_from_world: Rigid3, options: LocalizerOptions
+) -> tuple[LatentPoints, RefinedPose | None]:
+    """Stage 2 of the paper: guided matches, latent points (E1), pose (E2)."""
+    tracks = guide_matches(query, cam_from_world, options.max_guided_error_px * query.px)
+    latent = triangulate_robust(query.views, tracks, max_error=options.max_ray_error_px * query.px)
+    if len(latent.point) == 0:
+        return latent, None
+    refined = refine_pose(
+        cam_from_world,
+        latent.points3d,
+        query.points[latent.point],
+        point_covariance=latent.covariance,
+        sigma=options.keypoint_sigma_px * query.px,
+        max_error=options.max_reprojection_error_px * query.px,
+    )
+    return latent, refined
+
+
+def judge(
+    latent: LatentPoints, refined: RefinedPose, options: LocalizerOptions
+) -> tuple[Reason, str] | None:
+    """Say why a refined pose must not be used, or None."""
+    num_inliers, num_points = int(refined.inliers.sum()), len(latent.point)
+    if num_inliers < max(options.min_inliers, options.min_inlier_ratio * num_points):
+        return Reason.FEW_INLIERS, f"{num_inliers} of {num_points} latent points agree"
+    std = float(np.sqrt(np.linalg.eigvalsh(refined.covariance[:3, :3])[-1]))
+    depth = float(np.median(refined.cam_from_world.apply(latent.points3d[refined.inliers])[:, 2]))
+    limit = min(options.max_position_std_ratio * depth, options.max_position_std_m or np.inf)
+    if std > limit:
+        return Reason.HIGH_UNCERTAINTY, f"position to {std:.3g}, the limit is {limit:.3g}"
+    return None
