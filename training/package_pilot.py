@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import onnx
+
 from trigpoint.models.session import METADATA_KEY, Contract
 
 WEIGHTS = Path(__file__).parent.parent / "runtime" / "trigpoint" / "models" / "weights"

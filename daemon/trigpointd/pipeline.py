@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from trigpoint.errors import DatabaseError
-from trigpoint.frame import Frame, Localized, Lost, Result
+from trigpoint.frame import Frame, Localized, Result, describe
 from trigpoint.localizer import Localizer
 from trigpoint.rigid import Rigid3
 from trigpointd.messages.cdr import encode_pose
@@ -25,6 +22,10 @@ class Failure:
 
     reason: str
     detail: str
+
+    def describe(self) -> dict[str, Any]:
+        """Say in JSON's types what came of the frame."""
+        return {"status": "FAILED", "reason": self.reason, "detail": self.detail}
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +74,7 @@ class Pipeline:
         status = {
             "time_ns": frame.time_ns,
             "frame": frame.name,
-            **describe(result),
+            **(result.describe() if isinstance(result, Failure) else describe(result)),
             "latency_ms": round((time.perf_counter() - start_s) * 1e3, 3),
             "num_dropped": num_dropped,
         }
@@ -87,20 +88,3 @@ class Pipeline:
             return self._localizer.localize(frame)
         except DatabaseError as error:  # a damaged image; frames elsewhere can do without it
             return Failure("BAD_MAP", str(error))
-
-
-def describe(result: Result | Failure) -> dict[str, Any]:
-    """Say in JSON's types what came of a frame."""
-    if isinstance(result, Failure):
-        return {"status": "FAILED", "reason": result.reason, "detail": result.detail}
-    counts = dataclasses.asdict(result.statistics)
-    counts["stage_ms"] = {k: round(v, 3) for k, v in result.statistics.stage_ms.items()}
-    if isinstance(result, Lost):
-        return {"status": "LOST", "reason": result.reason, "detail": result.detail, **counts}
-    std = np.sqrt(np.diag(result.covariance))
-    return {
-        "status": "LOCALIZED",
-        "position_std_m": float(np.linalg.norm(std[:3])),
-        "rotation_std_deg": float(np.rad2deg(np.linalg.norm(std[3:]))),
-        **counts,
-    }

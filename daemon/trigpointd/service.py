@@ -101,12 +101,14 @@ async def serve(
     """Localize frames until the source ends or `stop` is set; what is in work is published."""
     slot = Latest[Captured](lossless=not source.live)
     totals = Totals()
-    async with asyncio.TaskGroup() as group:
-        feeding = group.create_task(_feed(source, slot))
-        stopping = group.create_task(_cancel_on(stop, feeding))
-        await _localize(slot, pipeline, list(sinks), totals)
-        stopping.cancel()
-    await source.close()
+    try:
+        async with asyncio.TaskGroup() as group:
+            feeding = group.create_task(_feed(source, slot))
+            stopping = group.create_task(_cancel_on(stop, feeding))
+            await _localize(slot, pipeline, list(sinks), totals)
+            stopping.cancel()
+    finally:
+        await source.close()
     if not feeding.cancelled() and (error := feeding.result()) is not None:
         raise error
     return totals
@@ -147,5 +149,5 @@ def _publish(sinks: list[Sink], output: Output) -> None:
         try:
             sink.publish(output)
         except TrigpointError as error:
-            _log.error("%s; going on without it", error)  # noqa: TRY400 - for users, not for us
+            _log.error("%s; going on without it", error)
             sinks.remove(sink)

@@ -26,7 +26,7 @@ CAMERA_FRAME = "camera"
 WORLD_FRAME = "world"
 FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".webp": "webp"}
 
-_START_NS = 1_700_000_000 * 10**9  # any fixed time: the same images give the same bytes
+START_TIME_NS = 1_700_000_000 * 10**9  # any fixed time: the same images give the same bytes
 _CHUNK_BYTES = 256 * 1024
 
 
@@ -44,7 +44,7 @@ def write_recording(
     images: Iterable[RecordedImage],
     *,
     rate_hz: float = 10.0,
-    start_time_ns: int = _START_NS,
+    start_time_ns: int = START_TIME_NS,
 ) -> int:
     """Write the images as a camera's recording and return their number.
 

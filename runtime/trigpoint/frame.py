@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,3 +140,18 @@ class Lost:
 
 
 Result = Localized | Lost
+
+
+def describe(result: Result) -> dict[str, Any]:
+    """Say in JSON's types what came of a frame."""
+    statistics = asdict(result.statistics)
+    statistics["stage_ms"] = {k: round(v, 3) for k, v in statistics["stage_ms"].items()}
+    if isinstance(result, Lost):
+        return {"status": "LOST", "reason": result.reason, "detail": result.detail, **statistics}
+    return {
+        "status": "LOCALIZED",
+        "reason": None,
+        "center": result.cam_from_world.center.tolist(),
+        "covariance": result.covariance.tolist(),
+        **statistics,
+    }

@@ -84,10 +84,11 @@ def recording(tmp_path: Path) -> Path:
 
 async def play(source: Source) -> list[Captured]:
     """Take all frames and close the source."""
-    async with contextlib.aclosing(source.frames()) as frames:
-        captured = [c async for c in frames]
-    await source.close()
-    return captured
+    try:
+        async with contextlib.aclosing(source.frames()) as frames:
+            return [c async for c in frames]
+    finally:
+        await source.close()
 
 
 def frames_of(path: Path, image_topic: str | None = None) -> list[Frame]:
@@ -190,14 +191,12 @@ def write_ros(path: Path, *, compressed: bool) -> Path:
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = "CompressedImage" if compressed else "Image"
     with path.open("wb") as stream, RosWriter(stream) as writer:
-        schemas = {
-            name: writer.register_msgdef(
-                name, store.generate_msgdef(name, ros_version=2)[0].replace("\r", "")
+        text, info_type, image_type = (
+            writer.register_msgdef(name, store.generate_msgdef(name, ros_version=2)[0])
+            for name in (
+                "std_msgs/msg/String",
+                *(f"sensor_msgs/msg/{k}" for k in ("CameraInfo", kind)),
             )
-            for name in ("sensor_msgs/msg/CameraInfo", f"sensor_msgs/msg/{kind}")
-        }
-        schemas["std_msgs/msg/String"] = writer.register_msgdef(
-            "std_msgs/msg/String", "string data"
         )
         for i in range(2):
             header = {"stamp": {"sec": 1_700_000_000, "nanosec": i}, "frame_id": "optical"}
@@ -217,8 +216,8 @@ def write_ros(path: Path, *, compressed: bool) -> Path:
             sent = {"header": header, **(file if compressed else size | pixels)}
             topic = "/cam/image_raw/compressed" if compressed else "/cam/image_raw"
             writer.write_message("/chatter", text, {"data": "hello"}, i)
-            writer.write_message("/cam/camera_info", schemas["sensor_msgs/msg/CameraInfo"], info, i)
-            writer.write_message(topic, schemas[f"sensor_msgs/msg/{kind}"], sent, i)
+            writer.write_message("/cam/camera_info", info_type, info, i)
+            writer.write_message(topic, image_type, sent, i)
     return path
 
 
@@ -452,6 +451,20 @@ def test_a_recording_that_ends_in_zeros_plays_its_whole_chunks(tmp_path: Path) -
     path.write_bytes(data[:half] + bytes(half))  # as a loss of power may leave it
     assert expected
     assert [shown(frame) for frame in frames_of(path)] == expected
+
+
+@given(st.data())
+@settings(max_examples=40, deadline=None)
+def test_whatever_bytes_are_wrong_only_a_source_error_comes_of_it(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = chunked(tmp_path_factory.mktemp("wrong") / "r.mcap")
+    content = bytearray(path.read_bytes())
+    for position in data.draw(st.lists(st.integers(8, len(content) - 1), max_size=5)):
+        content[position] = data.draw(st.integers(0, 255))
+    path.write_bytes(content)
+    with contextlib.suppress(SourceError):
+        assert len(asyncio.run(play(McapSource(path)))) <= 12
 
 
 def test_a_recording_without_an_index_plays(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+
 from tests.unit.synthetic_rays import (
     Scene,
     make_scene,
@@ -15,10 +16,14 @@ from tests.unit.synthetic_rays import (
     random_rotations,
     random_scene,
 )
-
 from trigpoint.geometry.anchor_ransac import AnchorConsensus, NoConsensus, find_consensus
 from trigpoint.geometry.center_averaging import average_centers, center_directions
-from trigpoint.rigid import Rigid3, rotation_angle, rotation_from_vector
+from trigpoint.rigid import (
+    Rigid3,
+    quaternion_from_rotation,
+    rotation_angle,
+    rotation_from_vector,
+)
 
 Array = NDArray[np.float64]
 
@@ -157,6 +162,21 @@ def test_whatever_the_relative_poses_a_consensus_includes_its_own_pair(seed: int
         assert result is NoConsensus.DISAGREEMENT
 
 
+def test_two_anchors_agree_though_their_quaternions_have_opposite_signs() -> None:
+    # Near a half turn, rotations a little apart have canonical quaternions of opposite signs.
+    half_turn = rotation_from_vector(np.array([0, 0, np.pi]))
+    opposite = 0
+    for seed in range(20):
+        scene = random_scene(np.random.default_rng(seed), 2, rotation_noise_rad=0.01)
+        scene = scene.in_other_world(1.0, half_turn.T @ scene.query_from_world.R, np.zeros(3))
+        q = quaternion_from_rotation(scene.query_from_anchors.R @ scene.anchors_from_world.R)
+        opposite += int(q[0] @ q[1] < 0)
+        result = agreed(scene)
+        assert result.inliers.all()
+        assert rotation_angle(result.R @ half_turn.T) < 0.05
+    assert opposite > 0
+
+
 def test_an_anchor_that_sees_the_query_behind_itself_is_an_outlier() -> None:
     scene = random_scene(np.random.default_rng(0), 6)
     result = agreed(with_opposite_direction(scene, np.array([2])))
@@ -242,7 +262,7 @@ def test_an_anchor_at_the_querys_place_agrees_by_its_rotation() -> None:
     rng = np.random.default_rng(0)
     centers = np.vstack([random_directions(rng, 5), [[0.01, 0, 0]]])
     scene = make_scene(centers, np.zeros(3), rng)
-    scene = with_direction_in_world(scene, 5, np.array([0, 1.0, 0]))
+    scene = with_direction_in_world(scene, 5, np.array([1.0, 0, 0]))  # away from it
     assert agreed(scene).inliers.all()
     assert not agreed(with_wrong_rotation(scene, np.array([5]))).inliers[5]
 
@@ -250,15 +270,41 @@ def test_an_anchor_at_the_querys_place_agrees_by_its_rotation() -> None:
 def test_anchors_amid_which_a_wrong_center_lies_do_not_vote_for_it() -> None:
     # Two anchors wrongly see the query amid four others, which see it 3 m farther on.
     crowd = np.array([[0.05, 0, 0], [-0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05]])
-    witnesses = np.array([[4.0, 3, 1], [-1, 3, 4]])
+    witness = np.array([[4.0, 3, 1]])
     wrong = np.array([[2.0, 0, 0], [0, 0, -2]])
     query = np.array([0, 3.0, 0])
-    scene = make_scene(np.vstack([crowd, witnesses, wrong]), query, np.random.default_rng(0))
-    scene = with_direction_in_world(scene, 6, np.array([-1.0, 0, 0]))
-    scene = with_direction_in_world(scene, 7, np.array([0, 0, 1.0]))
+    scene = make_scene(np.vstack([crowd, witness, wrong]), query, np.random.default_rng(0))
+    scene = with_direction_in_world(scene, 5, np.array([-1.0, 0, 0]))
+    scene = with_direction_in_world(scene, 6, np.array([0, 0, 1.0]))
     result = agreed(scene)
-    np.testing.assert_array_equal(np.flatnonzero(result.inliers), [0, 1, 2, 3, 4, 5])
+    np.testing.assert_array_equal(np.flatnonzero(result.inliers), [0, 1, 2, 3, 4])
     np.testing.assert_allclose(result.center, query, atol=1e-9)
+
+
+def test_an_anchor_exactly_at_the_proposed_center_is_no_division_by_zero() -> None:
+    centers = np.array([[-3.0, 0, 0], [0, -3, 0], [0, 0, 0]])
+    directions = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+    upright = np.tile(np.eye(3), (3, 1, 1))
+    scene = Scene(Rigid3(upright, -centers), Rigid3(upright, -directions), Rigid3.identity())
+    result = agreed(scene)
+    np.testing.assert_array_equal(result.center, [0, 0, 0])
+    assert result.inliers.all()
+
+
+def test_a_pair_that_does_not_vote_for_its_own_proposal_is_none_whoever_else_votes() -> None:
+    # Four anchors on one line, seeing along it; 4 and 5 pass it at 1 on either side, so that the
+    # midpoint of their rays lies on it; 6 and 7 meet elsewhere.
+    along = np.array([[-9.0, 0, 0], [-7, 0, 0], [-5, 0, 0], [-3, 0, 0]])
+    passing = np.array([[0, -3.0, 1], [0, 3, -1]])
+    meeting = np.array([[0, 47.0, 80], [3, 50, 80]])
+    centers = np.vstack([along, passing, meeting])
+    scene = make_scene(centers, np.array([0, 50.0, 80]), np.random.default_rng(0))
+    axes = np.array([[1.0, 0, 0]] * 4 + [[0.1, 1, 0], [0.1, -1, 0]])
+    for k, axis in enumerate(axes / np.linalg.norm(axes, axis=1, keepdims=True)):
+        scene = with_direction_in_world(scene, k, axis)
+    result = agreed(scene)
+    assert result.pair == (6, 7)
+    np.testing.assert_array_equal(np.flatnonzero(result.inliers), [6, 7])
 
 
 def test_of_equal_votes_the_smaller_errors_win() -> None:

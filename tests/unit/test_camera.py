@@ -65,7 +65,7 @@ def test_points_project_as_the_model_is_written(
 @given(points=image_points, depth=st.floats(0.1, 100))
 def test_normalizing_undoes_projecting(camera: Camera, points: Array, depth: float) -> None:
     px = camera.project(depth * np.column_stack([points, np.ones(len(points))]))
-    np.testing.assert_allclose(camera.normalize(px), points, atol=1e-9)
+    np.testing.assert_allclose(camera.normalize(px), points, atol=2e-8)  # px 6e-6
 
 
 @every_camera

@@ -3,89 +3,81 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Self
 
 from mcap.writer import CompressionType, Writer
 
 from trigpoint.errors import ConfigError, SourceError
 from trigpointd.messages.cdr import POSE_SCHEMA, POSE_TYPE
+from trigpointd.pipeline import Output
 from trigpointd.sources.base import Captured, Channel, Message
 
 _CHUNK_BYTES = 256 * 1024
 _FLUSH_S = 1.0
-_ANY_OBJECT: Mapping[str, object] = {"type": "object"}
+_STATUS_SCHEMA = b'{"type": "object"}'
 
 
 class McapLog:
-    """Writes a log; not safe to call from two threads at once.
+    """Writes a log; to be called from one thread at a time.
 
     A crash of the process costs the messages of the chunk in progress: at most `_CHUNK_BYTES` and,
     while messages keep coming, `_FLUSH_S`. A loss of power costs what the operating system has not
-    yet put on the disk. Everything is zstd: that costs 0.1 ms on a JPEG frame, and shrinks raw
-    images by a third, poses and status by 40 %.
+    yet put on the disk.
 
-    Where the disk is full a write raises a `SourceError` and the log is closed; what was written
+    Where the disk is full, writing raises a `SourceError` and the log is closed; what was written
     before can be read, and the caller goes on without a log.
 
     Parameters
     ----------
     path : Path
-        The file; one that exists is overwritten only on request.
-    base : str
-        What the pose's and the status' topic begin with.
-    status_schema : mapping, optional
-        JSON schema of the status.
-    overwrite : bool, optional
+        The file; one that exists is replaced only on request.
+    base_key : str
+        What the topics of poses and status begin with.
+    frames : bool
+        Whether to keep the messages that the frames came from; only then does the log replay.
+    overwrite : bool
         Whether to replace a file that exists.
     """
 
     def __init__(
-        self,
-        path: Path,
-        base: str,
-        *,
-        status_schema: Mapping[str, object] = _ANY_OBJECT,
-        overwrite: bool = False,
+        self, path: Path, base_key: str, *, frames: bool = True, overwrite: bool = False
     ) -> None:
         self._path = path
+        self._frames = frames
         try:
             self._stream = path.open("wb" if overwrite else "xb")
         except FileExistsError:
-            raise ConfigError(f"the log {path} exists; name another file") from None
+            raise ConfigError(
+                f"the log {path} exists; name another file or allow overwriting"
+            ) from None
         except OSError as error:
             raise ConfigError(f"cannot write the log {path}: {error.strerror}") from error
-        self._pose = Channel(f"{base}/pose", "cdr", POSE_TYPE, "ros2msg", POSE_SCHEMA.encode())
-        schema = json.dumps(status_schema).encode()
-        self._status = Channel(f"{base}/status", "json", "trigpoint.Status", "jsonschema", schema)
+        self._pose = Channel(f"{base_key}/pose", "cdr", POSE_TYPE, "ros2msg", POSE_SCHEMA.encode())
+        self._status = Channel(
+            f"{base_key}/status", "json", "trigpoint.Status", "jsonschema", _STATUS_SCHEMA
+        )
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self._channel_ids: dict[Channel, int] = {}
         self._calibration: Message | None = None
         self._flushed_s = time.monotonic()
-        self._writer = Writer(
-            self._stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD
-        )
+        # JPEG does not shrink, and beside it the rest hardly counts; alone that shrinks by 40 %.
+        compression = CompressionType.NONE if frames else CompressionType.ZSTD
+        self._writer = Writer(self._stream, chunk_size=_CHUNK_BYTES, compression=compression)
         with self._writing():
             self._writer.start(library="trigpoint")
 
-    def write_input(self, captured: Captured) -> None:
-        """Write the messages that a frame came from as they are, a calibration once."""
-        if captured.calibration is not None and captured.calibration is not self._calibration:
-            self._write(captured.calibration)
-            self._calibration = captured.calibration
-        if captured.image is not None:
-            self._write(captured.image)
-
-    def write_pose(self, log_time_ns: int, cdr: bytes) -> None:
-        """Write a pose as it was published."""
-        self._write(Message(self._pose, cdr, log_time_ns, log_time_ns))
-
-    def write_status(self, log_time_ns: int, status_json: bytes) -> None:
-        """Write a status as it was published."""
-        self._write(Message(self._status, status_json, log_time_ns, log_time_ns))
+    def publish(self, output: Output) -> None:
+        """Write the messages the frame came from, if asked to, the pose and the status."""
+        captured, time_ns = output.captured, output.captured.log_time_ns
+        if self._frames:
+            self._write_input(captured)
+        if output.pose is not None:
+            self._write(Message(self._pose, output.pose, time_ns, time_ns))
+        self._write(Message(self._status, output.status, time_ns, time_ns))
+        if time.monotonic() - self._flushed_s > _FLUSH_S:
+            self.flush()
 
     def flush(self) -> None:
         """Close the chunk in progress and hand it to the operating system."""
@@ -101,11 +93,12 @@ class McapLog:
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._stream.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
+    def _write_input(self, captured: Captured) -> None:
+        if captured.calibration is not None and captured.calibration is not self._calibration:
+            self._write(captured.calibration)
+            self._calibration = captured.calibration
+        if captured.image is not None:
+            self._write(captured.image)
 
     def _write(self, message: Message) -> None:
         with self._writing():
@@ -117,8 +110,6 @@ class McapLog:
                 message.sequence,
             )
             self._stream.flush()  # without effect unless a chunk was just closed
-        if time.monotonic() - self._flushed_s > _FLUSH_S:
-            self.flush()
 
     def _channel_id(self, channel: Channel) -> int:
         if channel not in self._channel_ids:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from types import TracebackType
-from typing import Self
 
 import zenoh
 

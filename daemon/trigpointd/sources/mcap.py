@@ -29,7 +29,8 @@ from trigpointd.messages.images import (
 from trigpointd.sources.base import BadFrame, Captured, Channel, Message
 
 _log = logging.getLogger(__name__)
-# What mcap and its decompressors (lz4: RuntimeError) raise on bytes that are not as they should be.
+# What mcap and its decompressors (lz4: RuntimeError) raise on bytes that are not as they should
+# be, and a disk that fails.
 _DAMAGE = (
     McapError,
     zstandard.ZstdError,
@@ -38,6 +39,7 @@ _DAMAGE = (
     LookupError,
     RuntimeError,
     MemoryError,
+    OSError,
 )
 
 

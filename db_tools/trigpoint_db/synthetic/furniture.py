@@ -36,7 +36,7 @@ class Box:
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
 
-    def moved(self, yaw_rad: float, offset: ArrayLike) -> Box:
+    def moved(self, yaw_rad: float = 0.0, offset: ArrayLike = (0, 0, 0)) -> Box:
         """Turn about the z axis of the frame, then shift."""
         turn = replace(self, yaw_rad=yaw_rad).axes.T
         center = turn @ self.center + np.asarray(offset, dtype=np.float64)
@@ -220,7 +220,7 @@ def pillar(rng: Generator, height: float) -> list[Box]:
     shaft = _box((-half, half), (-half, half), (0, height), materials.bricks)
     notice = _box((-0.1, 0.1), (half, half + 0.015), (1.2, 1.5), materials.painted, materials.page)
     back = _box((-0.12, 0.1), (half, half + 0.02), (1.0, 1.4), materials.painted, materials.poster)
-    return [shaft, notice, back.moved(np.pi, (0, 0, 0))]
+    return [shaft, notice, back.moved(np.pi)]
 
 
 def table(rng: Generator) -> list[Box]:

@@ -202,9 +202,9 @@ def screen(rng: Generator, shape: Shape) -> Image:
 
 def whiteboard(rng: Generator, shape: Shape) -> Image:
     """Draw a white board with writing and sketches."""
-    board = words(rng, _plain(shape, 215), 26, 60)
-    board[:, shape[1] // 2 :] = 215
-    shapes(rng, board[:, shape[1] // 2 :], 150, (20, 60))
+    board, middle = _plain(shape, 215), shape[1] // 2
+    words(rng, board[:, :middle], 26, 60)
+    shapes(rng, board[:, middle:], 110, (20, 50))
     cv2.rectangle(board, (0, 0), (shape[1] - 1, shape[0] - 1), 90, 14)
     return mottled(rng, board, 0.04)
 

@@ -85,37 +85,48 @@ def draw(
     homographies = homographies.astype(rays.x.dtype)
 
     corners = cam_from_world.apply(world.cells.corners)
-    seen = facing[world.cells.surface] & (corners[..., 2].max(axis=1) > NEAR_M)
-    cells = np.flatnonzero(seen)
+    cells = np.flatnonzero(
+        facing[world.cells.surface] & (corners[..., 2].max(axis=1, initial=-np.inf) > NEAR_M)
+    )
     outlines = _clip(corners[cells])
     centers = np.nanmean(outlines, axis=1)
     distances = np.linalg.norm(centers, axis=1)
-    normals = axes[world.cells.surface[cells], 2]
-    cosines = np.abs(np.einsum("ci,ci->c", normals, centers)) / distances
+    cosines = np.einsum("ci,ci->c", axes[world.cells.surface[cells], 2], -centers) / distances
+    # Between the sizes along and across the slant: less blur, and supersampling forgives it.
     samples_m = rays.pitch * centers[:, 2] / np.sqrt(np.maximum(cosines, 0.05))
     low = np.nanmin(outlines[..., :2] / outlines[..., 2:], axis=1)
     high = np.nanmax(outlines[..., :2] / outlines[..., 2:], axis=1)
 
     for i in np.argsort(distances):
-        window = (
-            _span(rays.y_range, low[i, 1], high[i, 1]),
-            _span(rays.x_range, low[i, 0], high[i, 0]),
-        )
+        columns = _span(rays.x_range, low[i, 0], high[i, 0])
+        rows = _span(rays.y_range, low[i, 1], high[i, 1])
         surface = int(world.cells.surface[cells[i]])
-        left, right, top, bottom = world.cells.bounds[cells[i]]
-        H = homographies[surface]
-        x, y, nearest = rays.x[window], rays.y[window], inverse_depth[window]
-        w = _affine(H[2], x, y)
-        mask = w > nearest
-        if not mask.any():
-            continue
-        with np.errstate(divide="ignore", invalid="ignore"):  # the horizon, outside the mask
-            z = 1 / w
-            s, t = _affine(H[0], x, y) * z, _affine(H[1], x, y) * z
-        mask &= (s >= left - _OVERLAP_M) & (s <= right + _OVERLAP_M)
-        mask &= (t >= top - _OVERLAP_M) & (t <= bottom + _OVERLAP_M)
-        np.maximum(nearest, w * mask, out=nearest)
-        yield Patch(surface, window, mask, s, t, samples_m[i])
+        seen = _see(
+            homographies[surface],
+            world.cells.bounds[cells[i]],
+            (rays.x[rows, columns], rays.y[rows, columns]),
+            inverse_depth[rows, columns],
+        )
+        if seen is not None:
+            yield Patch(surface, (rows, columns), *seen, samples_m[i])
+
+
+def _see(
+    H: Floats, bounds: Array, rays: tuple[Floats, Floats], nearest: Floats
+) -> tuple[NDArray[np.bool_], Floats, Floats] | None:
+    """Return where a cell is nearest, with s and t, and bring `nearest` up to date."""
+    w = _affine(H[2], *rays)
+    mask = w > nearest
+    if not mask.any():
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):  # the horizon, outside the mask
+        z = 1 / w
+        s, t = _affine(H[0], *rays) * z, _affine(H[1], *rays) * z
+    left, right, top, bottom = bounds
+    mask &= (s >= left - _OVERLAP_M) & (s <= right + _OVERLAP_M)
+    mask &= (t >= top - _OVERLAP_M) & (t <= bottom + _OVERLAP_M)
+    np.fmax(nearest, w * mask, out=nearest)  # fmax: rays outside the lens model's range are nan
+    return mask, s, t
 
 
 def _clip(corners: Array) -> Array:

@@ -52,7 +52,11 @@ class Face:
 
 @lru_cache(maxsize=2)
 def make_room(seed: int = 0) -> World:
-    """Furnish a room; another seed gives other textures and things in other places."""
+    """Furnish a room; another seed gives other textures and things in other places.
+
+    It takes seconds and the result is kept, so that each worker of a process pool can call this
+    for every picture rather than be sent the world.
+    """
     rng = np.random.default_rng(seed)
     boxes = _furnish(rng)
     lamps = [_lamp(x, y) for x in (-1.4, 1.4) for y in (-1.4, 1.4)]
@@ -69,17 +73,18 @@ def _furnish(rng: Generator) -> list[Box]:
     half, quarter = WIDTH_M / 2, np.pi / 2
     groups = (furniture.bookcase, furniture.desk, furniture.sofa, furniture.door)
     boxes = [
-        box.moved(0, (0, -half, 0)).moved(k * quarter, (0, 0, 0))
+        box.moved(offset=(0, -half, 0)).moved(k * quarter)
         for k, group in enumerate(rng.permutation(4))
         for box in groups[group](rng)
     ]
+    corner = (half - 0.42, half - 0.42, 0)
     for k in rng.permutation(4)[:3]:
         stack = furniture.crates(rng)
-        boxes += [b.moved(0, (half - 0.42, half - 0.42, 0)).moved(k * quarter, 0) for b in stack]
+        boxes += [b.moved(offset=corner).moved(k * quarter) for b in stack]
     turn = rng.uniform(0, 2 * np.pi)
-    boxes += [b.moved(turn, 0) for b in furniture.pillar(rng, HEIGHT_M)]
+    boxes += [b.moved(turn) for b in furniture.pillar(rng, HEIGHT_M)]
     aside = rng.uniform(0.95, 1.1)
-    boxes += [b.moved(0.3, (aside, 0, 0)).moved(turn + 0.4, 0) for b in furniture.table(rng)]
+    boxes += [b.moved(0.3, (aside, 0, 0)).moved(turn + 0.4) for b in furniture.table(rng)]
     beam = np.array([0.14, WIDTH_M, 0.12])
     boxes += [
         Box(np.array([x, 0, HEIGHT_M - beam[2] / 2]), beam, materials.wood)

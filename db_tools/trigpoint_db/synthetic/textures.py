@@ -150,7 +150,7 @@ def words(rng: Generator, image: Image, height: float, level: float) -> Image:
     rows, columns = image.shape
     font, scale = int(rng.choice(_FONTS)), height / 22
     for baseline in np.arange(1.6 * height, rows - 0.4 * height, 1.7 * height):
-        length = int(columns / height * rng.uniform(0.6, 1.1))
+        length = int(columns / height * rng.uniform(0.5, 0.95))
         line = "".join(rng.choice(_LETTERS, max(2, length)))
         line = " ".join(line[i : i + 5] for i in range(0, len(line), 5))
         origin = (round(0.6 * height), round(baseline))

@@ -58,10 +58,14 @@ def survey_poses(world: World, num: int, seed: int = 0) -> Rigid3:
     x, y = (np.arange(a + 0.4, b - 0.4, 0.25) for a, b in zip(low[:2], high[:2], strict=True))
     grid = np.stack(np.meshgrid(x, y, (0.8, 1.3, 1.8)), axis=-1).reshape(-1, 3)
     free = grid[world.clearance(grid) > _SURVEY_CLEARANCE_M]
-    stations = _farthest_points(free, -(-num // _HEADINGS), rng)
-    yaw = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS + rng.uniform(
-        0, 2 * np.pi, (len(stations), 1)
-    )
+    num_stations = -(-num // _HEADINGS)
+    if len(free) < num_stations:
+        raise ConfigError(
+            f"found {len(free)} places for {num_stations} survey stations; ask for fewer images"
+        )
+    stations = _farthest_points(free, num_stations, rng)
+    headings = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
+    yaw = headings + rng.uniform(0, 2 * np.pi, (num_stations, 1))
     centers = stations[:, None] + rng.uniform(-0.05, 0.05, (*yaw.shape, 3))
     pitch, roll = rng.uniform(-0.3, 0.05, yaw.shape), rng.uniform(-0.03, 0.03, yaw.shape)
     return look_along(centers.reshape(-1, 3), yaw.ravel(), pitch.ravel(), roll.ravel())[:num]
@@ -101,7 +105,8 @@ def _free_loop(world: World, rng: np.random.Generator) -> CubicSpline:
         free = np.argmax(clearance > 1.2 * FLIGHT_CLEARANCE_M, axis=1)
         loop = places[np.arange(_WAYPOINTS), free]
         path = CubicSpline(turns / turns[-1], np.vstack([loop, loop[:1]]), bc_type="periodic")
-        if world.clearance(path(np.linspace(0, 1, _FINE))).min() > FLIGHT_CLEARANCE_M:
+        # Between the checked points, some mm apart, the curve may come a little nearer.
+        if world.clearance(path(np.linspace(0, 1, _FINE))).min() > FLIGHT_CLEARANCE_M + 0.01:
             return path
     raise ConfigError(
         f"found no flight {FLIGHT_CLEARANCE_M} m clear of everything; use a world with more space"
@@ -110,9 +115,10 @@ def _free_loop(world: World, rng: np.random.Generator) -> CubicSpline:
 
 def _farthest_points(points: Array, num: int, rng: np.random.Generator) -> Array:
     """Choose `num` of the points (N, 3), each the farthest from those chosen before."""
-    chosen = [int(rng.integers(len(points)))]
+    chosen = rng.integers(len(points), size=num)
     distance = np.full(len(points), np.inf)
-    while len(chosen) < num:
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-        chosen.append(int(np.argmax(distance)))
+    for i in range(1, num):
+        last = points[chosen[i - 1]]
+        distance = np.minimum(distance, np.linalg.norm(points - last, axis=1))
+        chosen[i] = np.argmax(distance)
     return points[chosen]

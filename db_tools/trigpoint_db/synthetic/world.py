@@ -50,7 +50,7 @@ class Surface:
             half = ((columns + 1) // 2, (rows + 1) // 2)
             smaller = cv2.resize(pyramid[-1], half, interpolation=cv2.INTER_AREA)
             pyramid.append(np.asarray(smaller, dtype=np.uint8))
-        return cls(origin, u, v, width, height, tuple(pyramid))
+        return cls(origin, u, v, float(width), float(height), tuple(pyramid))
 
     @property
     def normal(self) -> Array:
@@ -116,7 +116,8 @@ class World:
 
     def clearance(self, points: Array) -> Array:
         """Distances (N,) in metres from points (N, 3) to the nearest surface, < 0 behind it."""
-        offset = np.einsum("sij,nsj->nsi", self.axes, points[:, None] - self.origins)
+        offset = (points @ self.axes.reshape(-1, 3).T).reshape(len(points), -1, 3)
+        offset -= np.einsum("sij,sj->si", self.axes, self.origins)
         beside = offset[..., :2] - np.clip(offset[..., :2], 0, self.extents)
         height = offset[..., 2]
         distance = np.sqrt(np.square(beside).sum(axis=-1) + height**2)

@@ -1,90 +1,196 @@
-"""Reading a map: everything resident in the mapping, nothing loaded beforehand."""
+"""Reading a map: rows and descriptors are used where they lie in the mapping."""
 
 from __future__ import annotations
 
-import errno
-import os
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from weakref import WeakValueDictionary
+from typing import Self
 
-import lmdb
 import numpy as np
 from numpy.typing import NDArray
 
 from trigpoint.database import schema
-from trigpoint.database.pages import Tree, read_meta
+from trigpoint.database.pages import DamageError
+from trigpoint.database.snapshot import Snapshot, reporting
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import Anchor, ModelIdentity
 from trigpoint.rigid import Rigid3
 
-MAX_MAP_BYTES = 2**37  # of address space, not of disk; arm64 kernels may have 2**39 of it
-
-# LMDB wants one environment for a file in a process: readers and a writer share it.
-_environments: WeakValueDictionary[tuple[int, int, int], lmdb.Environment] = WeakValueDictionary()
+Array32 = NDArray[np.float32]
 
 
-def share_environment(path: Path, fd: int) -> lmdb.Environment:
-    """Return this process's environment of an open file; it closes with its last user."""
-    status = os.fstat(fd)
-    key = (os.getpid(), status.st_dev, status.st_ino)
-    environment = _environments.get(key)
-    if environment is None:
-        environment = _environments[key] = _open_environment(path)
-    return environment
+class MapReader:
+    """A map, read on one snapshot.
 
+    A writer at work cannot reuse pages that the snapshot sees: `refresh` now and then.
+    """
 
-def _open_environment(path: Path) -> lmdb.Environment:
-    # A reader too opens for writing where it may, so that a writer can join it in this process.
-    try:
-        environment = lmdb.open(
-            str(path),
-            map_size=MAX_MAP_BYTES,
-            subdir=False,
-            readonly=not os.access(path, os.W_OK),
-            mode=0o644,
-            lib_version=0,
-        )
-    except lmdb.Error as error:
-        if error.code not in (errno.EACCES, errno.EROFS):
-            raise
-        # Nobody may make a lock file here: read without one, and see `Snapshot.is_kept`.
-        return lmdb.open(
-            str(path),
-            map_size=MAX_MAP_BYTES,
-            subdir=False,
-            readonly=True,
-            lock=False,
-            lib_version=0,
-        )
-    environment.reader_check()  # frees what readers that died still hold
-    return environment
+    def __init__(self, path: Path, snapshot: Snapshot) -> None:
+        self._path = path
+        self._snapshot: Snapshot | None = snapshot
+
+    @classmethod
+    def open(cls, path: Path, model: ModelIdentity | None = None) -> Self:
+        """Open a map; with a model, refuse a map that was made with another one."""
+        with reporting(path):
+            return cls(path, Snapshot(path, model))
+
+    @property
+    def _current(self) -> Snapshot:
+        if self._snapshot is None:
+            raise DatabaseError(f"{self._path}: this reader is closed")
+        return self._snapshot
+
+    @contextmanager
+    def _reading(self) -> Iterator[Snapshot]:
+        with reporting(self._path):
+            try:
+                yield self._current
+            finally:
+                self._current.require_kept()
+
+    @property
+    def model(self) -> ModelIdentity:
+        """Which network made the features."""
+        return self._current.metadata.model
+
+    @property
+    def generation(self) -> int:
+        """Rises with each commit."""
+        return self._current.metadata.generation
+
+    def __len__(self) -> int:
+        return self._current.metadata.num_images
+
+    def names(self) -> list[str]:
+        """Return the names of all images, by index."""
+        with self._reading() as snapshot:
+            images = (snapshot.get(schema.image_key(index)) for index in range(len(self)))
+            return [schema.decode_name(image) for image in images]
+
+    def cam_from_world(self, index: int) -> Rigid3:
+        """Return the pose of an image."""
+        with self._reading() as snapshot:
+            return _image(snapshot, index).cam_from_world
+
+    def anchor(self, index: int) -> Anchor:
+        """Return an image with its features."""
+        with self._reading() as snapshot:
+            image = _image(snapshot, index)
+            keypoints, descriptors = schema.decode_features(
+                image, snapshot.get(schema.features_key(index)), self.model.descriptor_dim
+            )
+        return Anchor(image.name, image.camera, image.cam_from_world, keypoints, descriptors)
+
+    def search(self, global_descriptor: Array32, k: int) -> tuple[NDArray[np.intp], Array32]:
+        """Find the images that look most alike, by comparing with all.
+
+        Parameters
+        ----------
+        global_descriptor : (G,) float32
+            L2-normalised.
+        k : int
+            How many, at the most.
+
+        Returns
+        -------
+        indices : (k,) int
+            Most similar first; equally similar ones by index.
+        similarities : (k,) float32
+            Cosines.
+        """
+        dim = self.model.global_dim
+        if global_descriptor.shape != (dim,) or not np.isfinite(global_descriptor).all():
+            raise DatabaseError(
+                f"{self._path}: searched for numbers {global_descriptor.shape}; "
+                f"its global descriptors are ({dim},), all finite"
+            )
+        similarities = np.empty(len(self), np.float32)
+        with self._reading() as snapshot:
+            for block, start in enumerate(range(0, len(similarities), schema.BLOCK_ROWS)):
+                part = similarities[start : start + schema.BLOCK_ROWS]
+                scales, rows = _rows(snapshot, block)
+                np.multiply(rows.astype(np.float32) @ global_descriptor, scales, out=part)
+        return _largest(similarities, k)
+
+    def refresh(self) -> bool:
+        """Move to the newest snapshot, also of another file renamed into place; True if it differs.
+
+        Where that one cannot be used, the error is raised and the old one stays.
+        """
+        old = self._current
+        with reporting(self._path):
+            new = Snapshot(self._path, old.metadata.model)
+        if (new.file, new.metadata.generation) == (old.file, old.metadata.generation):
+            new.close()
+            return False
+        self._snapshot = new
+        old.close()
+        return True
+
+    def verify(self) -> list[str]:
+        """Check everything, whether checked before or not, and list what is wrong."""
+        problems: list[str] = []
+        num_blocks = -(-len(self) // schema.BLOCK_ROWS)
+        with self._reading() as snapshot:
+            snapshot.forget_checks()
+            for index in range(len(self)):
+                with _collecting(problems):
+                    name = _image(snapshot, index).name
+                    snapshot.get(schema.features_key(index))
+                    if schema.decode_index(snapshot.get(schema.name_key(name))) != index:
+                        problems.append(f"the name {name!r} does not lead to image {index}")
+            for block in range(num_blocks):
+                with _collecting(problems):
+                    _rows(snapshot, block)
+            found, wanted = snapshot.count_entries(), 1 + 3 * len(self) + num_blocks
+            if found != wanted:
+                problems.append(f"there are {found} entries where {wanted} belong")
+        return problems
+
+    def close(self) -> None:
+        """Close the map."""
+        if self._snapshot is not None:
+            self._snapshot.close()
+            self._snapshot = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 @contextmanager
-def reporting(path: Path) -> Iterator[None]:
-    """Name the map in every error, also in LMDB's and the operating system's."""
+def _collecting(problems: list[str]) -> Iterator[None]:
     try:
         yield
-    except DatabaseError as error:
-        raise DatabaseError(f"{path}: {error}") from error
-    except lmdb.InvalidError as error:
-        raise DatabaseError(f"{path}: is not a Trigpoint map") from error
-    except (lmdb.Error, OSError) as error:
-        raise DatabaseError(f"{path}: {error}") from error
+    except DamageError as error:
+        problems.append(str(error))
 
 
-@dataclass(eq=False)
-class Snapshot:
-    """A map as one commit left it, whatever a writer does meanwhile."""
+def _image(snapshot: Snapshot, index: int) -> schema.Image:
+    if not 0 <= index < snapshot.metadata.num_images:
+        raise DatabaseError(f"no image {index} among {snapshot.metadata.num_images}")
+    return schema.decode_image(snapshot.get(schema.image_key(index)))
 
-    file: tuple[int, int]  # device and inode
-    metadata: schema.Metadata
-    _fd: int
-    _txn: lmdb.Transaction[memoryview]
-    _tree: Tree
-    _checked: set[bytes] = field(default_factory=set)
+
+def _rows(snapshot: Snapshot, block: int) -> tuple[Array32, NDArray[np.int8]]:
+    metadata = snapshot.metadata
+    payload = snapshot.get(schema.block_key(block))
+    scales, rows = schema.decode_block(payload, metadata.model.global_dim)
+    wanted = min(metadata.num_images - block * schema.BLOCK_ROWS, schema.BLOCK_ROWS)
+    if len(rows) != wanted:
+        raise DamageError(f"retrieval block {block} has {len(rows)} rows, not {wanted}")
+    return scales, rows
+
+
+def _largest(values: Array32, k: int) -> tuple[NDArray[np.intp], Array32]:
+    """Return where the k largest lie, largest first, equal ones in order; and these."""
+    k = min(k, len(values))
+    if k < 1:
+        return np.empty(0, np.intp), np.empty(0, np.float32)
+    candidates = np.flatnonzero(values >= np.partition(values, -k)[-k])
+    best = candidates[np.argsort(-values[candidates], kind="stable")[:k]]
+    return best, values[best]

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trigpoint.camera import PARAMETERS, Camera
-from trigpoint.database.pages import HEADER_BYTES
+from trigpoint.database.pages import HEADER_BYTES, DamageError
 from trigpoint.errors import ConfigError, DatabaseError
 from trigpoint.frame import LocalFeatures, ModelIdentity
 from trigpoint.rigid import Rigid3
@@ -85,10 +85,10 @@ def seal(key: bytes, payload: bytes) -> bytes:
 def unseal(key: bytes, value: memoryview | None, *, check: bool = True) -> memoryview:
     """Return what follows the checksum, after comparing it."""
     if value is None:
-        raise DatabaseError(f"{describe_key(key)} is missing")
+        raise DamageError(f"{describe_key(key)} is missing")
     payload = value[_CRC.size :]
     if check and value[: _CRC.size] != _CRC.pack(zlib.crc32(payload, zlib.crc32(key))):
-        raise DatabaseError(f"{describe_key(key)} is damaged: its checksum does not match")
+        raise DamageError(f"{describe_key(key)} is damaged: its checksum does not match")
     return payload
 
 
@@ -110,8 +110,8 @@ class Metadata:
         fields = json.loads(bytes(payload))
         if (found := fields.pop("format")) != FORMAT:
             raise DatabaseError(
-                f"has format {found}, and this version reads format {FORMAT}; "
-                "rebuild it with `trigpoint-db build`, or use the version that made it"
+                f"a map of format {found}, and this version reads format {FORMAT}; "
+                "rebuild it with `trigpoint-db build` or use the version that made it"
             )
         return cls(**{**fields, "model": ModelIdentity(**fields["model"])})
 
@@ -155,7 +155,7 @@ def encode_image(
 
     stored = HEADER_BYTES + _CRC.size + keypoints.nbytes + descriptors.nbytes
     overhang = stored % 4096 if stored > 4096 else 0
-    inline = -(-overhang // 4) if overhang <= _MAX_INLINE_BYTES else 0
+    num_inline = -(-overhang // 4) if overhang <= _MAX_INLINE_BYTES else 0
     header = _IMAGE.pack(
         *cam_from_world.quaternion,
         *cam_from_world.t,
@@ -164,30 +164,36 @@ def encode_image(
         camera.width,
         camera.height,
         num_keypoints,
-        inline,
+        num_inline,
     )
     return (
-        header + keypoints[:inline].tobytes() + name.encode(),
-        keypoints[inline:].tobytes() + descriptors.tobytes(),
+        header + keypoints[:num_inline].tobytes() + name.encode(),
+        keypoints[num_inline:].tobytes() + descriptors.tobytes(),
     )
+
+
+def decode_name(payload: memoryview) -> str:
+    """Read an image's name only."""
+    num_inline = _IMAGE.unpack_from(payload)[-1]
+    return bytes(payload[_IMAGE.size + 4 * num_inline :]).decode()
 
 
 def decode_image(payload: memoryview) -> Image:
     """Read an image."""
-    *numbers, model, width, height, num_keypoints, inline = _IMAGE.unpack_from(payload)
+    *numbers, model, width, height, num_keypoints, num_inline = _IMAGE.unpack_from(payload)
     model = model.rstrip(b"\0").decode()
     params = numbers[7 : 7 + len(PARAMETERS.get(model, ()))]
     try:
         camera = Camera(model, width, height, tuple(params))
     except ConfigError as error:
-        raise DatabaseError(f"an image needs another version of Trigpoint: {error}") from error
-    rest = payload[_IMAGE.size :]
+        raise DatabaseError(f"made by another version of Trigpoint: {error}") from error
+    inline = payload[_IMAGE.size : _IMAGE.size + 4 * num_inline]
     return Image(
-        name=bytes(rest[4 * inline :]).decode(),
+        name=decode_name(payload),
         camera=camera,
         cam_from_world=Rigid3.from_quaternion(numbers[:4], numbers[4:7]),
         num_keypoints=num_keypoints,
-        first_keypoints=np.frombuffer(rest[: 4 * inline], "<u2").reshape(-1, 2),
+        first_keypoints=np.frombuffer(inline, "<u2").reshape(-1, 2),
     )
 
 

@@ -60,11 +60,12 @@ def find_consensus(
 ) -> AnchorConsensus | NoConsensus:
     """Return the pose, of those that pairs of anchors propose, with the most votes.
 
-    A pair proposes the midpoint between its rays c_k + lambda d_k, lambda > 0, and the mean of
-    its rotations R_qk R_k. Anchor k votes for a proposal (c, R) if its ray points there,
-    angle(d_k, c - c_k) <= max_direction_error_rad, which a center behind it never satisfies, and
-    its rotation agrees, angle(R_qk R_k, R) <= max_rotation_error_rad. A tie goes to the least sum
-    of errors, each as a fraction of its threshold and 1 at most.
+    A pair proposes the midpoint between its lines c_k + lambda d_k and the mean of its rotations
+    R_qk R_k. Anchor k votes for a proposal (c, R) if its ray points there, angle(d_k, c - c_k) <=
+    max_direction_error_rad, which a center behind it never satisfies, and its rotation agrees,
+    angle(R_qk R_k, R) <= max_rotation_error_rad. Proposals without the votes of their own pair
+    are dropped. A tie goes to the least sum of errors, each as a fraction of its threshold and 1
+    at most.
 
     Parameters
     ----------
@@ -73,7 +74,7 @@ def find_consensus(
     query_from_anchors : Rigid3 (K,)
         Relative poses (R_qk, T_qk); the translations may have any length but zero.
     max_direction_error_rad, max_rotation_error_rad : float
-        Between 0 and pi / 2; also the most by which the two rotations of a pair may differ.
+        Between 0 and pi / 2. The latter also bounds how much a pair's two rotations differ.
     min_angle_rad : float
         Rays closer than this to parallel (or opposed) cross nowhere in particular, and their
         pair proposes nothing.
@@ -90,8 +91,8 @@ def find_consensus(
     An anchor at the query's own place sees it in no direction, and that of its relative pose is
     arbitrary. So an anchor nearer to the winning center than that is certain
     (max_direction_error_rad times the mean distance of the proposing pair) is an inlier by its
-    rotation alone. Its line passes as near as it stands, which does averaging no harm. It has no
-    vote for that reason, or else wrong centers amid many anchors would win.
+    rotation alone: its line passes as near as it stands, which does averaging no harm. But it
+    does not vote by its rotation alone, or wrong centers amid many anchors would win.
 
     Where all rays but one lie on one line, that one alone decides where on it the center is.
     """
@@ -107,8 +108,6 @@ def find_consensus(
     if len(pairs) == 0:
         return NoConsensus.DEGENERATE
     midpoints, ranges = _meet(centers[pairs], directions[pairs])
-    in_front = (ranges > 0).all(axis=1)
-    pairs, midpoints, ranges = pairs[in_front], midpoints[in_front], ranges[in_front]
     q_pairs = _mean_of_two(q[pairs])
 
     towards = midpoints[:, None] - centers
@@ -117,6 +116,7 @@ def find_consensus(
     direction_errors = np.arccos(np.clip(cosines, -1, 1)) / max_direction_error_rad
     rotation_errors = _rotation_angles(q_pairs, q) / max_rotation_error_rad
     votes = (direction_errors <= 1) & (rotation_errors <= 1)
+    # A pair among its own voters is in front of both and keeps the inliers from being colinear.
     supported = np.take_along_axis(votes, pairs, axis=1).all(axis=1)
     if not supported.any():
         return NoConsensus.DISAGREEMENT

@@ -1,0 +1,98 @@
+"""Make a map from images with known poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from trigpoint.camera import Camera
+from trigpoint.database.writer import MapWriter
+from trigpoint.errors import ConfigError
+from trigpoint.frame import Frame
+from trigpoint.images import read_gray
+from trigpoint.models.features import FeatureModel
+from trigpoint_db.importers.colmap import PosedImage
+
+
+def select_images(images: Sequence[PosedImage], names: Sequence[str]) -> list[PosedImage]:
+    """Keep the images named; a name that the model does not know is an error."""
+    by_name = {image.name: image for image in images}
+    unknown = [name for name in names if name not in by_name]
+    if unknown:
+        raise ConfigError(
+            f"{len(unknown)} of {len(names)} listed images are not in the COLMAP model, "
+            f"such as {unknown[0]!r}"
+        )
+    return [by_name[name] for name in names]
+
+
+def check_files(names: Iterable[str], folder: Path) -> None:
+    """Refuse before any work is done where an image is missing."""
+    missing = [name for name in names if not (folder / name).is_file()]
+    if missing:
+        raise ConfigError(f"{len(missing)} images are missing in {folder}, such as {missing[0]!r}")
+
+
+def read_frame(path: Path, camera: Camera, name: str) -> Frame:
+    """Read an image file that a camera has taken."""
+    image = read_gray(path)
+    height, width = image.shape
+    if (width, height) != (camera.width, camera.height):
+        raise ConfigError(
+            f"{path} has {width} x {height} px, its camera {camera.width} x {camera.height}: "
+            "use the images the camera was calibrated with"
+        )
+    return Frame(image, camera, name=name)
+
+
+def build_map(
+    path: Path,
+    images: Iterable[PosedImage],
+    folder: Path,
+    model: FeatureModel,
+    *,
+    max_keypoints: int = 1024,
+) -> int:
+    """Write a new map; it appears under its name when it is complete. Returns the image count."""
+    if path.exists():
+        raise ConfigError(f"{path} exists; remove it first, or add to it with --append")
+    partial = path.with_name(path.name + ".partial")
+    lock = partial.with_name(partial.name + "-lock")
+    partial.unlink(missing_ok=True)
+    try:
+        with MapWriter.create(partial, model.identity) as writer:
+            count = _add(writer, images, folder, model, max_keypoints)
+        partial.rename(path)
+    finally:
+        partial.unlink(missing_ok=True)
+        lock.unlink(missing_ok=True)
+    return count
+
+
+def append_map(
+    path: Path,
+    images: Iterable[PosedImage],
+    folder: Path,
+    model: FeatureModel,
+    *,
+    max_keypoints: int = 1024,
+) -> int:
+    """Add images to a map, all or none of them."""
+    with MapWriter.open(path, model.identity) as writer:
+        return _add(writer, images, folder, model, max_keypoints)
+
+
+def _add(
+    writer: MapWriter,
+    images: Iterable[PosedImage],
+    folder: Path,
+    model: FeatureModel,
+    max_keypoints: int,
+) -> int:
+    count = 0
+    for image in images:
+        frame = read_frame(folder / image.name, image.camera, image.name)
+        features = model.extract(frame.image, max_keypoints)
+        writer.add(image.name, image.camera, image.cam_from_world, features)
+        count += 1
+    return count

@@ -1,0 +1,267 @@
+"""The command `trigpoint-db`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from trigpoint.camera import Camera
+from trigpoint.database.reader import MapReader
+from trigpoint.errors import ConfigError, TrigpointError
+from trigpoint.frame import Localized
+from trigpoint.localizer import Localizer
+from trigpoint.models.features import FeatureModel
+from trigpoint.rigid import Rigid3
+from trigpoint.stages import LocalizerOptions
+from trigpoint_db.build import append_map, build_map, check_files, select_images
+from trigpoint_db.demo import make_demo
+from trigpoint_db.evaluate import evaluate, plot_paths
+from trigpoint_db.importers.colmap import read_model
+from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
+from trigpoint_db.localize import Outcome, localize_images
+from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
+from trigpoint_db.recording import RecordedImage, write_recording
+
+T = TypeVar("T")
+app = typer.Typer(
+    help="Off-line tools on maps, recordings and results.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+console = Console()
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
+Model = Annotated[Path | None, typer.Option(help="A feature network; ours by default.")]
+MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="A .tpmap file.")]
+
+
+def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
+    """Show a progress bar on standard error, which keeps standard output clean."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
+        yield from progress.track(items, total=total, description=what)
+
+
+@app.command()
+def build(
+    map_: MapPath,
+    colmap: Annotated[Path, typer.Option(help="Folder of a COLMAP model, text or binary.")],
+    images: Annotated[Path, typer.Option(help="Folder of the images.")],
+    list_: Annotated[Path | None, typer.Option("--list", help="Only these names.")] = None,
+    append: Annotated[bool, typer.Option("--append", help="Add to a map.")] = False,
+    keypoints: Annotated[int, typer.Option(help="At most so many an image.", min=50)] = 1024,
+    model: Model = None,
+    as_json: Json = False,
+) -> None:
+    """Make a map from images with known poses."""
+    posed = read_model(colmap)
+    if list_ is not None:
+        posed = select_images(posed, read_names(list_))
+    check_files((image.name for image in posed), images)
+    write = append_map if append else build_map
+    network = FeatureModel.load(model)
+    count = write(
+        map_, track(posed, "mapping", len(posed)), images, network, max_keypoints=keypoints
+    )
+    size = map_.stat().st_size
+    if as_json:
+        print(json.dumps({"map": str(map_), "num_images_added": count, "bytes": size}))
+    else:
+        print(f"{map_}: {count} images added, {size / 1e6:.1f} MB")
+
+
+@app.command()
+def localize(
+    map_: MapPath,
+    images: Annotated[Path, typer.Option(help="Folder of the query images.")],
+    queries: Annotated[Path, typer.Option(help="Lines `name MODEL width height params...`.")],
+    poses: Annotated[Path, typer.Option(help="Write `name qw qx qy qz tx ty tz`.")],
+    results: Annotated[Path | None, typer.Option(help="Write a JSON line a query.")] = None,
+    anchors: Annotated[int, typer.Option(help="How many to retrieve.", min=2)] = 20,
+    model: Model = None,
+    as_json: Json = False,
+) -> None:
+    """Localize images; OK poses go to a file, what came of every query to another."""
+    wanted = read_queries(queries)
+    check_files((query.name for query in wanted), images)
+    network = FeatureModel.load(model)
+    with MapReader.open(map_, network.identity) as reader:
+        outcomes = list(_localize(reader, network, wanted, images, anchors))
+    write_poses(
+        poses,
+        {o.name: o.result.cam_from_world for o in outcomes if isinstance(o.result, Localized)},
+    )
+    if results is not None:
+        results.write_text("".join(json.dumps(o.to_json()) + "\n" for o in outcomes))
+    counts = Counter(outcome.reason for outcome in outcomes)
+    if as_json:
+        print(json.dumps({"num_queries": len(outcomes), "outcomes": counts}))
+    else:
+        print(f"{counts['LOCALIZED']} of {len(outcomes)} localized", end="")
+        others = [f"{n} {reason}" for reason, n in counts.items() if reason != "LOCALIZED"]
+        print("".join(f", {other}" for other in others))
+    bad = [outcome for outcome in outcomes if outcome.result is None]
+    if bad:
+        raise ConfigError(f"{len(bad)} images could not be used, such as {bad[0].error}")
+
+
+def _localize(
+    reader: MapReader, network: FeatureModel, queries: list[Query], folder: Path, anchors: int
+) -> Iterator[Outcome]:
+    from time import perf_counter
+
+    options = LocalizerOptions(num_anchors=anchors)
+    localizer = Localizer(network, reader, options, clock=perf_counter)
+    yield from track(localize_images(localizer, queries, folder), "localizing", len(queries))
+
+
+@app.command("evaluate")
+def evaluate_command(
+    poses: Annotated[Path, typer.Option(help="Estimated poses.")],
+    truth: Annotated[Path, typer.Option(help="A COLMAP model's folder, or a pose file.")],
+    queries: Annotated[
+        Path | None, typer.Option(help="What was asked for; without: all of the truth.")
+    ] = None,
+    log: Annotated[Path | None, typer.Option(help="A daemon's MCAP log: show latency.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw both paths (PNG).")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare poses with the truth; a query without a pose counts as a failure."""
+    estimates, reference = read_poses(poses), read_truth(truth)
+    names = list(reference) if queries is None else read_names(queries)
+    evaluation = evaluate(estimates, reference, names)
+    stage_times = None if log is None else read_stage_times(log)
+    if as_json:
+        report = evaluation.to_json()
+        if stage_times is not None:
+            report["latency_ms"] = summarize_latency(stage_times)
+        print(json.dumps(report))
+    else:
+        evaluation.print_table(console)
+        if stage_times is not None:
+            print_latency(console, stage_times)
+    if picture is not None:
+        plot_paths(estimates, {name: reference[name] for name in names}, picture)
+        console.print(f"picture: {picture}", soft_wrap=True)
+
+
+def read_truth(path: Path) -> dict[str, Rigid3]:
+    """Read reference poses from a COLMAP model's folder or a pose file."""
+    if path.is_dir():
+        return {image.name: image.cam_from_world for image in read_model(path)}
+    return read_poses(path)
+
+
+@app.command()
+def info(map_: MapPath, as_json: Json = False) -> None:
+    """Say what a map holds."""
+    with MapReader.open(map_) as reader:
+        centers = np.array([reader.cam_from_world(i).center for i in range(len(reader))])
+        facts: dict[str, Any] = {
+            "map": str(map_),
+            "num_images": len(reader),
+            "generation": reader.generation,
+            "model": reader.model.name,
+            "model_sha256": reader.model.sha256,
+            "descriptor_dim": reader.model.descriptor_dim,
+            "global_dim": reader.model.global_dim,
+            "bytes": map_.stat().st_size,
+            "min_center": centers.min(axis=0).tolist() if len(centers) else None,
+            "max_center": centers.max(axis=0).tolist() if len(centers) else None,
+        }
+    if as_json:
+        print(json.dumps(facts))
+        return
+    table = Table(show_header=False)
+    for key, value in facts.items():
+        table.add_row(key, str(value))
+    console.print(table)
+
+
+@app.command()
+def verify(map_: MapPath, as_json: Json = False) -> None:
+    """Check every record of a map; exit code 1 where something is wrong."""
+    with MapReader.open(map_) as reader:
+        problems, count = reader.verify(), len(reader)
+    if as_json:
+        print(json.dumps({"map": str(map_), "num_images": count, "problems": problems}))
+    else:
+        for problem in problems:
+            print(problem)
+        print(f"{map_}: {count} images, {len(problems) or 'no'} problems")
+    if problems:
+        raise typer.Exit(1)
+
+
+@app.command()
+def record(
+    out: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording.")],
+    images: Annotated[Path, typer.Option(help="Folder of the images, in order of name.")],
+    camera: Annotated[
+        str | None, typer.Option(help="'MODEL width height params...' of all of them.")
+    ] = None,
+    queries: Annotated[
+        Path | None, typer.Option(help="Only these, `name MODEL width height params...`.")
+    ] = None,
+    rate: Annotated[float, typer.Option(help="Images a second.", min=0.01)] = 10.0,
+    truth: Annotated[Path | None, typer.Option(help="A COLMAP model's folder.")] = None,
+) -> None:
+    """Write images to a recording that `trigpointd` and Foxglove play."""
+    if (camera is None) == (queries is None):
+        raise ConfigError("give either --camera for all images or --queries with one for each")
+    if queries is not None:
+        wanted = read_queries(queries)
+        check_files((query.name for query in wanted), images)
+    else:
+        common = Camera.from_text(camera or "")
+        wanted = [Query(name, common) for name in _image_names(images)]
+    poses = {} if truth is None else read_truth(truth)
+    recorded = [RecordedImage(images / q.name, q.camera, poses.get(q.name)) for q in wanted]
+    count = write_recording(out, track(recorded, "recording", len(recorded)), rate_hz=rate)
+    print(f"{out}: {count} images, {count / rate:.1f} s")
+
+
+def _image_names(folder: Path) -> list[str]:
+    suffixes = {".jpg", ".jpeg", ".png"}
+    if not folder.is_dir():
+        raise ConfigError(f"no such folder: {folder}")
+    names = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in suffixes)
+    if not names:
+        raise ConfigError(f"{folder} holds no JPEG or PNG images")
+    return names
+
+
+@app.command()
+def demo(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to; made if missing.")],
+    survey: Annotated[int, typer.Option(help="Images of the map.", min=10)] = 140,
+    flight: Annotated[int, typer.Option(help="Frames of the flight.", min=2)] = 120,
+    seed: Annotated[int, typer.Option(help="Another seed, another room.")] = 0,
+) -> None:
+    """Render a room, survey and fly through it: images, map, recording, truth, settings."""
+    posed = make_demo(folder, num_survey=survey, num_flight=flight, seed=seed, progress=track)
+    map_ = folder / "map.tpmap"
+    map_.unlink(missing_ok=True)
+    network = FeatureModel.load()
+    build_map(map_, track(posed, "mapping", len(posed)), folder / "survey", network)
+    print(f"{folder}: map of {survey} images, flight of {flight} frames, trigpointd.toml")
+
+
+def main() -> None:
+    """Run the command; an error is one line and exit code 1."""
+    try:
+        app()
+    except TrigpointError as error:
+        sys.exit(f"trigpoint-db: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)

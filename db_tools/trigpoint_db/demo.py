@@ -1,0 +1,119 @@
+"""The demo: a small rendered world, surveyed and flown through, ready for the daemon."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from trigpoint.camera import Camera
+from trigpoint.errors import ConfigError
+from trigpoint.poses import format_pose
+from trigpoint.rigid import Rigid3
+from trigpoint_db.importers.colmap import PosedImage, write_model
+from trigpoint_db.recording import START_TIME_NS, RecordedImage, write_recording
+from trigpoint_db.synthetic import World, flight_poses, make_room, render, survey_poses
+
+# A lens with some distortion, as real ones have.
+CAMERA = Camera("OPENCV", 640, 480, (460.0, 460.0, 319.5, 239.5, -0.08, 0.02, 0.001, -0.0005))
+# The camera looks ahead from the nose of the drone: body x ahead, y left, z up; camera x right,
+# y down, z ahead.
+BODY_FROM_CAMERA = Rigid3.from_quaternion((0.5, -0.5, 0.5, -0.5), (0.12, 0.0, 0.03))
+
+_CONFIG = """\
+# Settings of `trigpointd run`; docs/configuration.md describes every key.
+map = "map.tpmap"
+base_key = "trigpoint/demo"
+
+[source]
+type = "mcap"
+path = "flight.mcap"
+
+[camera] # where it sits on the body
+position_m = [0.12, 0.0, 0.03]
+rotation_wxyz = [0.5, -0.5, 0.5, -0.5]
+
+[zenoh]
+connect = ["tcp/127.0.0.1:17447"]
+multicast_scouting = false
+wait_for_subscriber_s = 10.0
+
+[log]
+path = "log.mcap"
+overwrite = true
+"""
+
+
+def render_images(
+    world: World, cams_from_world: Rigid3, folder: Path, *, seed: int, num_jobs: int = 2
+) -> Iterator[PosedImage]:
+    """Render one JPEG a pose into a folder, yielding each as it is done, in order."""
+    folder.mkdir(parents=True, exist_ok=True)
+    poses = [cams_from_world[i] for i in range(len(cams_from_world))]
+    work = partial(_render_one, world, folder, seed)
+    with ProcessPoolExecutor(num_jobs) as pool:
+        yield from pool.map(work, range(len(poses)), poses)
+
+
+def _render_one(
+    world: World, folder: Path, seed: int, index: int, cam_from_world: Rigid3
+) -> PosedImage:
+    cv2.setNumThreads(1)
+    name = f"{index:06d}.jpg"
+    image = render(world, CAMERA, cam_from_world, seed=seed + index)
+    if not cv2.imwrite(str(folder / name), image, [cv2.IMWRITE_JPEG_QUALITY, 92]):
+        raise ConfigError(f"cannot write images to {folder}")
+    return PosedImage(name, CAMERA, cam_from_world)
+
+
+def make_demo(
+    folder: Path,
+    *,
+    num_survey: int = 140,
+    num_flight: int = 120,
+    rate_hz: float = 10.0,
+    seed: int = 0,
+    progress: Callable[[Iterator[PosedImage], str, int], Iterator[PosedImage]],
+) -> list[PosedImage]:
+    """Render the survey and the flight; write the COLMAP model, the recording, truth, settings.
+
+    Returns the survey, from which the map is built. `truth.txt` holds the body's poses, as
+    `trigpointd watch --poses` writes them.
+    """
+    world = make_room(seed)
+    survey = list(
+        progress(
+            render_images(
+                world, survey_poses(world, num_survey, seed), folder / "survey", seed=1000
+            ),
+            "survey",
+            num_survey,
+        )
+    )
+    write_model(folder / "sparse", survey)
+    flight = list(
+        progress(
+            render_images(
+                world, flight_poses(world, num_flight, seed), folder / "flight", seed=5000
+            ),
+            "flight",
+            num_flight,
+        )
+    )
+    write_recording(
+        folder / "flight.mcap",
+        [RecordedImage(folder / "flight" / i.name, i.camera, i.cam_from_world) for i in flight],
+        rate_hz=rate_hz,
+    )
+    times_ns = START_TIME_NS + np.round(np.arange(num_flight) * 1e9 / rate_hz).astype(np.int64)
+    lines = [
+        format_pose(str(time_ns), BODY_FROM_CAMERA @ image.cam_from_world)
+        for time_ns, image in zip(times_ns, flight, strict=True)
+    ]
+    (folder / "truth.txt").write_text("".join(lines))
+    (folder / "trigpointd.toml").write_text(_CONFIG)
+    return survey

@@ -1,0 +1,1 @@
+"""Surveys from other programs, as posed images."""

@@ -1,0 +1,144 @@
+"""hloc's text files: lists of images, queries with their cameras, and poses."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from trigpoint.camera import Camera
+from trigpoint.errors import ConfigError
+from trigpoint.rigid import Rigid3
+
+# Names may hold spaces: the camera begins at the first word followed by the two sizes.
+_QUERY = re.compile(r"(?P<name>\S.*?)\s+(?P<camera>[A-Z][A-Z_]*\s+\d+\s+\d+\s.*)")
+
+
+@dataclass(frozen=True)
+class Query:
+    """An image to localize and the camera that took it."""
+
+    name: str
+    camera: Camera
+
+
+def read_names(path: Path) -> list[str]:
+    """Read an image list: a name on each line, in the file's order."""
+    names: dict[str, None] = {}
+    for where, name in _read_entries(path):
+        _check_new(where, name, names)
+        names[name] = None
+    return list(names)
+
+
+def read_queries(path: Path) -> list[Query]:
+    """Read `name MODEL width height params...` lines, in the file's order."""
+    queries: dict[str, Query] = {}
+    for where, line in _read_entries(path):
+        match = _QUERY.fullmatch(line)
+        if match is None:
+            raise ConfigError(
+                f"{where}: expected 'name MODEL width height params...', not {line[:80]!r}"
+            )
+        try:
+            query = Query(match["name"], Camera.from_text(match["camera"]))
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
+        _check_new(where, query.name, queries)
+        queries[query.name] = query
+    return list(queries.values())
+
+
+def read_poses(path: Path) -> dict[str, Rigid3]:
+    """Read `name qw qx qy qz tx ty tz` lines: cam_from_world by name, in the file's order."""
+    poses: dict[str, Rigid3] = {}
+    for where, line in _read_entries(path):
+        name, *numbers = line.rsplit(maxsplit=7)  # from the right: names may hold spaces
+        try:
+            values = [float(number) for number in numbers]
+        except ValueError:
+            values = []
+        if len(values) != 7:
+            raise ConfigError(f"{where}: expected 'name qw qx qy qz tx ty tz', not {line[:80]!r}")
+        _check_new(where, name, poses)
+        poses[name] = pose_from_numbers(where, values)
+    return poses
+
+
+def write_poses(path: Path, poses: Mapping[str, Rigid3]) -> None:
+    """Write what `read_poses` reads, sorted by name: equal poses give equal bytes."""
+    lines = [format_pose(name, poses[name]) for name in sort_names(poses)]
+    write_atomically(path, "".join(lines))
+
+
+def format_pose(name: str, cam_from_world: Rigid3) -> str:
+    """Format a line `name qw qx qy qz tx ty tz` with every digit of the numbers."""
+    if not is_writable(name) or name.startswith("#"):
+        raise ConfigError(f"the name {name!r} cannot stand in a text file; rename the image")
+    return f"{name} {format_numbers(*cam_from_world.quaternion, *cam_from_world.t)}\n"
+
+
+def format_numbers(*values: float) -> str:
+    """Format numbers with every digit, separated by spaces."""
+    return " ".join(repr(float(value) + 0.0) for value in values)  # + 0.0 makes 0.0 of -0.0
+
+
+def is_writable(name: str) -> bool:
+    """Say whether a name survives being written to a line of text and read again."""
+    return bool(name) and name.isprintable() and name == name.strip()
+
+
+def pose_from_numbers(where: str, values: Sequence[float]) -> Rigid3:
+    """Make cam_from_world of qw qx qy qz tx ty tz; `where` says where they stand."""
+    if not all(map(math.isfinite, values)):
+        raise ConfigError(f"{where}: the pose {format_numbers(*values)} is not finite")
+    if not 1e-9 < math.hypot(*values[:4]) < 1e9:  # far from 1, it is not a quaternion
+        raise ConfigError(
+            f"{where}: the quaternion {format_numbers(*values[:4])} is not one of a rotation; "
+            "it comes first, as qw qx qy qz, and has length 1"
+        )
+    return Rigid3.from_quaternion(values[:4], values[4:])
+
+
+def sort_names(names: Iterable[str]) -> list[str]:
+    """Sort names, by value where all are integers, such as times in nanoseconds."""
+    names = list(names)
+    if all(name.removeprefix("-").isdecimal() for name in names):
+        return sorted(names, key=lambda name: (int(name), name))
+    return sorted(names)
+
+
+def read_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield every line, stripped, and before it `path:number` for messages."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            for number, line in enumerate(file, 1):
+                yield f"{path}:{number}", line.strip()
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"cannot read {path}: it is not UTF-8 text") from error
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file that appears under its name once it is whole."""
+    partial = path.with_name(path.name + ".partial")
+    try:
+        try:
+            partial.write_text(text, encoding="utf-8", newline="\n")
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _read_entries(path: Path) -> Iterator[tuple[str, str]]:
+    return ((where, line) for where, line in read_lines(path) if line and line[0] != "#")
+
+
+def _check_new(where: str, name: str, seen: Mapping[str, object]) -> None:
+    if name in seen:
+        raise ConfigError(f"{where}: {name} is in this file twice; remove one")

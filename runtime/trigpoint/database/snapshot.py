@@ -1,0 +1,161 @@
+"""One consistent state of a map file, and the errors that opening and reading it can give."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from weakref import WeakValueDictionary
+
+import lmdb
+
+from trigpoint.database import schema
+from trigpoint.database.pages import NOT_A_MAP, DamageError, Meta, Tree, read_meta
+from trigpoint.errors import DatabaseError
+from trigpoint.frame import ModelIdentity
+
+MAX_MAP_BYTES = 2**37  # of address space, not of disk; arm64 kernels may offer no more than 2**39
+
+# LMDB wants one environment for a file in a process: readers and a writer share it.
+_environments: WeakValueDictionary[tuple[int, int, int], lmdb.Environment] = WeakValueDictionary()
+
+
+def share_environment(path: Path, fd: int) -> lmdb.Environment:
+    """Return this process's environment of an open file; it closes with its last user."""
+    status = os.fstat(fd)
+    key = (os.getpid(), status.st_dev, status.st_ino)
+    environment = _environments.get(key)
+    if environment is None:
+        environment = _environments[key] = _open_environment(path)
+    return environment
+
+
+def _open_environment(path: Path) -> lmdb.Environment:
+    # A reader too opens for writing where it may, so that a writer can join it in this process.
+    try:
+        environment = lmdb.open(
+            str(path),
+            map_size=MAX_MAP_BYTES,
+            subdir=False,
+            readonly=not os.access(path, os.W_OK),
+            mode=0o644,
+            lib_version=0,
+        )
+    except lmdb.Error as error:
+        if error.code not in (errno.EACCES, errno.EROFS):
+            raise
+        # Nobody may make a lock file here: read without one, and see `Snapshot.is_kept`.
+        return lmdb.open(
+            str(path),
+            map_size=MAX_MAP_BYTES,
+            subdir=False,
+            readonly=True,
+            lock=False,
+            lib_version=0,
+        )
+    environment.reader_check()  # frees what readers that died still hold
+    return environment
+
+
+@contextmanager
+def reporting(path: Path) -> Iterator[None]:
+    """Name the map, and what to do, in every error: ours, LMDB's, the operating system's."""
+    try:
+        yield
+    except DamageError as error:
+        raise DatabaseError(
+            f"{path}: {error}; restore it from a copy or rebuild it with `trigpoint-db build`"
+        ) from error
+    except DatabaseError as error:
+        raise DatabaseError(f"{path}: {error}") from error
+    except FileNotFoundError as error:
+        raise DatabaseError(f"no such map: {path}; `trigpoint-db build` makes one") from error
+    except OSError as error:
+        raise DatabaseError(f"{path}: {error.strerror}") from error
+    except lmdb.InvalidError as error:
+        raise DatabaseError(f"{path}: {NOT_A_MAP}") from error
+    except lmdb.Error as error:
+        raise DatabaseError(f"{path}: {error}") from error
+
+
+class Snapshot:
+    """A map as one commit left it, whatever a writer does meanwhile."""
+
+    def __init__(self, path: Path, model: ModelIdentity | None = None) -> None:
+        with ExitStack() as stack:
+            if not stat.S_ISREG(path.stat().st_mode):
+                raise DatabaseError("not a file; a map is one")
+            self._fd = os.open(path, os.O_RDONLY)
+            stack.callback(os.close, self._fd)
+            status = os.fstat(self._fd)
+            self.file = status.st_dev, status.st_ino
+            for slot in (0, 1):
+                read_meta(self._fd, slot)  # before LMDB sees the file
+            self._environment = share_environment(path, self._fd)
+            self._txn, meta = self._begin()
+            stack.callback(self._txn.abort)
+            self._tree = Tree(self._fd, meta)
+            self._checked: set[bytes] = set()
+            self._tree.check(schema.METADATA_KEY)
+            if self._txn.get(schema.METADATA_KEY) is None:
+                raise DatabaseError(NOT_A_MAP)
+            self.metadata = schema.Metadata.decode(self.get(schema.METADATA_KEY))
+            if model not in (None, self.metadata.model):
+                raise DatabaseError(
+                    f"made with {_describe(self.metadata.model)}, not with {_describe(model)}; "
+                    "rebuild it with `trigpoint-db build`"
+                )
+            self._stack = stack.pop_all()
+
+    def _begin(self) -> tuple[lmdb.Transaction[memoryview], Meta]:
+        for _ in range(10):
+            txn = self._environment.begin(buffers=True)
+            meta = read_meta(self._fd, txn.id() % 2)
+            if meta.commit == txn.id():
+                return txn, meta
+            txn.abort()  # a writer has committed twice since
+        raise DamageError("its first pages contradict each other")
+
+    def get(self, key: bytes) -> memoryview:
+        """Return a value where it lies; its checksum is compared the first time."""
+        self._tree.check(key)
+        payload = schema.unseal(key, self._txn.get(key), check=key not in self._checked)
+        self._checked.add(key)
+        return payload
+
+    def forget_checks(self) -> None:
+        """Check everything again."""
+        self._checked.clear()
+        self._tree.forget_checks()
+
+    def count_entries(self) -> int:
+        """Count keys, ours and foreign ones."""
+        return self._txn.stat()["entries"]
+
+    def require_kept(self) -> None:
+        """Raise DatabaseError if a writer may have reused pages of this snapshot.
+
+        With a lock file it cannot. Without one, pages that a commit left over are reused from the
+        second commit after it on.
+        """
+        if self._environment.flags()["lock"]:
+            return
+        if self._environment.info()["last_txnid"] > self._txn.id() + 1:
+            raise DatabaseError(
+                "has changed since, and as no lock file can be made beside it nothing kept "
+                "this snapshot; refresh it"
+            )
+
+    def close(self) -> None:
+        """Let the snapshot go; views of it are invalid from here on."""
+        self._stack.close()
+
+
+def _describe(model: ModelIdentity) -> str:
+    return (
+        f"model {model.name!r} {model.sha256[:12]} "
+        f"({model.descriptor_dim} and {model.global_dim} numbers a descriptor)"
+    )

@@ -1,0 +1,237 @@
+"""Making a map and adding images to it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Self
+
+import lmdb
+import numpy as np
+from lmdb.verify import VerifyError, verify
+from numpy.typing import NDArray
+
+from trigpoint.camera import Camera
+from trigpoint.database import schema
+from trigpoint.database.pages import DamageError
+from trigpoint.database.snapshot import Snapshot, reporting, share_environment
+from trigpoint.errors import DatabaseError
+from trigpoint.frame import LocalFeatures, ModelIdentity
+from trigpoint.rigid import Rigid3
+
+
+class MapWriter:
+    """Adds images to a map. As a context it commits at the end, and drops them on an exception.
+
+    There is one writer of a map at a time, beside any number of readers. Images not yet committed
+    are in memory and lost in a crash; committed ones are on disk. A failure to write closes the
+    writer. Use it in one thread.
+    """
+
+    def __init__(self, path: Path, fd: int, metadata: schema.Metadata) -> None:
+        self._path = path
+        self._fd = fd
+        self._metadata = metadata  # as committed
+        self._num_images = metadata.num_images
+        self._scales: list[np.float32] = []  # of the last retrieval block, unless it is full
+        self._rows: list[NDArray[np.int8]] = []
+        self._environment: lmdb.Environment | None = share_environment(path, fd)
+        self._txn: lmdb.Transaction | None = None
+        if self._environment.flags()["readonly"]:
+            raise DatabaseError("cannot be written: no lock file can be made beside it")
+
+    @classmethod
+    def create(cls, path: Path, model: ModelIdentity) -> Self:
+        """Make an empty map for features of a model."""
+        with reporting(path), ExitStack() as undo:
+            try:
+                fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+            except FileExistsError:
+                raise DatabaseError("exists already; remove it, or add to it") from None
+            except FileNotFoundError:
+                raise DatabaseError("cannot be made: its folder does not exist") from None
+            undo.callback(path.unlink)
+            undo.callback(os.close, fd)
+            _lock(fd)
+            writer = cls(path, fd, schema.Metadata(model))
+            with writer._writing() as txn:
+                writer._put(txn, schema.METADATA_KEY, writer._metadata.encode())
+                txn.commit()
+                writer._txn = None
+            undo.pop_all()
+            return writer
+
+    @classmethod
+    def open(cls, path: Path, model: ModelIdentity) -> Self:
+        """Open a map to add images whose features come from the same model."""
+        with reporting(path), ExitStack() as undo:
+            fd = os.open(path, os.O_RDWR)
+            undo.callback(os.close, fd)
+            _lock(fd)
+            with closing(Snapshot(path, model)) as snapshot:
+                _require_sound(path)
+                writer = cls(path, fd, snapshot.metadata)
+                writer._load_last_block(snapshot)
+            undo.pop_all()
+            return writer
+
+    def __len__(self) -> int:
+        return self._num_images
+
+    def add(
+        self, name: str, camera: Camera, cam_from_world: Rigid3, features: LocalFeatures
+    ) -> int:
+        """Add an image and return its index; one that cannot be added leaves no trace."""
+        with self._writing() as txn:
+            _require_name(name)
+            _require_pose(cam_from_world)
+            _require_features(features, camera, self._metadata.model)
+            if txn.get(schema.name_key(name)) is not None:
+                raise DatabaseError(f"holds an image {name!r} already")
+            index = self._num_images
+            image, arrays = schema.encode_image(name, camera, cam_from_world, features)
+            self._put(txn, schema.name_key(name), schema.encode_index(index))
+            self._put(txn, schema.image_key(index), image)
+            self._put(txn, schema.features_key(index), arrays)
+            scale, row = schema.quantize_row(features.global_descriptor)
+            self._scales.append(scale)
+            self._rows.append(row)
+            self._num_images += 1
+            if len(self._rows) == schema.BLOCK_ROWS:
+                self._put_last_block(txn)
+                self._scales, self._rows = [], []
+        return index
+
+    def commit(self) -> None:
+        """Put what was added on disk; returns when it is there."""
+        if self._num_images == self._metadata.num_images:
+            return
+        with self._writing() as txn:
+            if self._rows:
+                self._put_last_block(txn)
+            metadata = replace(
+                self._metadata,
+                generation=self._metadata.generation + 1,
+                num_images=self._num_images,
+            )
+            self._put(txn, schema.METADATA_KEY, metadata.encode())
+            txn.commit()
+            self._txn, self._metadata = None, metadata
+
+    def close(self) -> None:
+        """Drop what was not committed and let other writers in."""
+        if self._environment is None:
+            return
+        if self._txn is not None:
+            self._txn.abort()
+        self._txn = self._environment = None
+        os.close(self._fd)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, exception: type[BaseException] | None, *_: object) -> None:
+        try:
+            if exception is None:
+                self.commit()
+        finally:
+            self.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[lmdb.Transaction]:
+        with reporting(self._path):
+            if self._environment is None:
+                raise DatabaseError("this writer is closed")
+            try:
+                if self._txn is None:
+                    self._txn = self._environment.begin(write=True)
+                yield self._txn
+            except lmdb.Error as error:
+                self.close()
+                raise DatabaseError(
+                    f"cannot be written: {error.reason}; what was committed is kept"
+                ) from error
+
+    def _put(self, txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
+        txn.put(key, schema.seal(key, payload))
+
+    def _put_last_block(self, txn: lmdb.Transaction) -> None:
+        block = schema.encode_block(np.array(self._scales), np.array(self._rows))
+        self._put(txn, schema.block_key((self._num_images - 1) // schema.BLOCK_ROWS), block)
+
+    def _load_last_block(self, snapshot: Snapshot) -> None:
+        block, num_rows = divmod(self._num_images, schema.BLOCK_ROWS)
+        if num_rows:
+            payload = snapshot.get(schema.block_key(block))
+            scales, rows = schema.decode_block(payload, self._metadata.model.global_dim)
+            self._scales, self._rows = list(scales), list(rows.copy())
+
+
+def _lock(fd: int) -> None:
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise DatabaseError("another writer has it open; wait until it has finished") from None
+
+
+def _require_sound(path: Path) -> None:
+    """Check all that LMDB trusts when it writes: a wrong list of free pages would cost images."""
+    try:
+        problems = verify(path)  # type: ignore[no-untyped-call]
+    except VerifyError as error:
+        raise DamageError(str(error)) from error
+    if problems:
+        raise DamageError(problems[0])
+
+
+def _require_name(name: str) -> None:
+    try:
+        size = len(name.encode())
+    except UnicodeEncodeError as error:
+        raise DatabaseError(f"cannot hold the name {name!r}: it is not valid Unicode") from error
+    if not 1 <= size <= schema.MAX_NAME_BYTES:
+        raise DatabaseError(
+            f"cannot hold a name of {size} bytes ({name[:40]!r}...); "
+            f"1 to {schema.MAX_NAME_BYTES} are possible"
+        )
+
+
+def _require_pose(cam_from_world: Rigid3) -> None:
+    R, t = cam_from_world.R, cam_from_world.t
+    if R.shape != (3, 3) or t.shape != (3,):
+        raise DatabaseError(f"holds one pose an image, not {R.shape} and {t.shape}")
+    if not (np.isfinite(R).all() and np.isfinite(t).all()):
+        raise DatabaseError("cannot hold a pose that is not finite")
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-5 or np.linalg.det(R) < 0:
+        raise DatabaseError(f"cannot hold a pose whose R is no rotation: {R.tolist()}")
+
+
+def _require_features(features: LocalFeatures, camera: Camera, model: ModelIdentity) -> None:
+    num_keypoints = len(features)
+    if num_keypoints > schema.MAX_KEYPOINTS:
+        raise DatabaseError(
+            f"cannot hold {num_keypoints} keypoints of an image; "
+            f"{schema.MAX_KEYPOINTS} are possible"
+        )
+    wanted = {
+        "keypoints": (num_keypoints, 2),
+        "descriptors": (num_keypoints, model.descriptor_dim),
+        "global_descriptor": (model.global_dim,),
+    }
+    for field, shape in wanted.items():
+        array = getattr(features, field)
+        if array.shape != shape:
+            raise DatabaseError(
+                f"its model {model.name!r} gives {field} {shape}, these are {array.shape}"
+            )
+        if not np.isfinite(array).all():
+            raise DatabaseError(f"cannot hold {field} that are not finite")
+    limit = (camera.width - 0.5, camera.height - 0.5)
+    if ((features.keypoints < -0.5) | (features.keypoints > limit)).any():
+        raise DatabaseError(
+            f"keypoints lie outside their image of {camera.width} x {camera.height} px"
+        )
