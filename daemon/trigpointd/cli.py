@@ -11,9 +11,9 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from trigpoint.poses import format_pose
 
 from trigpoint.errors import TrigpointError
+from trigpoint.poses import format_pose
 from trigpointd.config import Config, LogConfig, SourceConfig, ZenohConfig, load_config
 from trigpointd.service import open_pipeline, open_source, run
 from trigpointd.sinks.base import Sink
@@ -144,3 +144,7 @@ def main() -> None:
         sys.exit(f"trigpointd: {error}")
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

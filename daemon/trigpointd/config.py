@@ -122,10 +122,12 @@ def _resolve(section: S, folder: Path) -> S:
 
 
 def _explain(error: ValidationError) -> str:
-    """Put the first thing that is wrong in one line; for an unknown key, name the nearest one."""
-    first = error.errors()[0]
+    """Put one thing that is wrong in one line; for an unknown key, name the nearest one."""
+    unknown = ("extra_forbidden", "unexpected_keyword_argument")
+    # A mistyped key is both unknown and missing: the former says more.
+    first = min(error.errors(), key=lambda item: item["type"] not in unknown)
     where = ".".join(str(part) for part in first["loc"])
-    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+    if first["type"] in unknown:
         known = _keys(first["loc"][:-1])
         near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1, cutoff=0.0)
         return f"unknown key {where!r}; did you mean {near[0]!r}?"

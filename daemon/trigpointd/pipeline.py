@@ -80,7 +80,6 @@ class Pipeline:
         }
         return Output(captured, result, pose, json.dumps(status).encode())
 
-
     def _localize(self, frame: Frame | BadFrame) -> Result | Failure:
         if isinstance(frame, BadFrame):
             return Failure("BAD_FRAME", frame.detail)

@@ -65,6 +65,7 @@ def run(config: Config, extra_sinks: Sequence[Sink] = ()) -> Totals:
             wait_s = config.zenoh.wait_for_subscriber_s
             if wait_s > 0 and not zenoh.wait_for_subscriber(wait_s):
                 _log.warning("nobody has subscribed to the poses in %g s; going on", wait_s)
+        _log.info("localizing %s against %s", config.source.path, config.map)
         return asyncio.run(_run_until_signal(source, pipeline, sinks))
 
 

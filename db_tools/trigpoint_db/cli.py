@@ -265,3 +265,7 @@ def main() -> None:
         sys.exit(f"trigpoint-db: {error}")
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

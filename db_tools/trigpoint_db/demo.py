@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ from trigpoint.poses import format_pose
 from trigpoint.rigid import Rigid3
 from trigpoint_db.importers.colmap import PosedImage, write_model
 from trigpoint_db.recording import START_TIME_NS, RecordedImage, write_recording
-from trigpoint_db.synthetic import World, flight_poses, make_room, render, survey_poses
+from trigpoint_db.synthetic import flight_poses, make_room, render, survey_poses
 
 # A lens with some distortion, as real ones have.
 CAMERA = Camera("OPENCV", 640, 480, (460.0, 460.0, 319.5, 239.5, -0.08, 0.02, 0.001, -0.0005))
@@ -49,22 +50,23 @@ overwrite = true
 
 
 def render_images(
-    world: World, cams_from_world: Rigid3, folder: Path, *, seed: int, num_jobs: int = 2
+    room_seed: int, cams_from_world: Rigid3, folder: Path, *, noise_seed: int, num_jobs: int = 2
 ) -> Iterator[PosedImage]:
     """Render one JPEG a pose into a folder, yielding each as it is done, in order."""
     folder.mkdir(parents=True, exist_ok=True)
     poses = [cams_from_world[i] for i in range(len(cams_from_world))]
-    work = partial(_render_one, world, folder, seed)
-    with ProcessPoolExecutor(num_jobs) as pool:
+    work = partial(_render_one, room_seed, folder, noise_seed)
+    # OpenCV's threads do not survive a fork.
+    with ProcessPoolExecutor(num_jobs, mp_context=get_context("spawn")) as pool:
         yield from pool.map(work, range(len(poses)), poses)
 
 
 def _render_one(
-    world: World, folder: Path, seed: int, index: int, cam_from_world: Rigid3
+    room_seed: int, folder: Path, noise_seed: int, index: int, cam_from_world: Rigid3
 ) -> PosedImage:
     cv2.setNumThreads(1)
     name = f"{index:06d}.jpg"
-    image = render(world, CAMERA, cam_from_world, seed=seed + index)
+    image = render(make_room(room_seed), CAMERA, cam_from_world, seed=noise_seed + index)
     if not cv2.imwrite(str(folder / name), image, [cv2.IMWRITE_JPEG_QUALITY, 92]):
         raise ConfigError(f"cannot write images to {folder}")
     return PosedImage(name, CAMERA, cam_from_world)
@@ -88,7 +90,7 @@ def make_demo(
     survey = list(
         progress(
             render_images(
-                world, survey_poses(world, num_survey, seed), folder / "survey", seed=1000
+                seed, survey_poses(world, num_survey, seed), folder / "survey", noise_seed=1000
             ),
             "survey",
             num_survey,
@@ -98,7 +100,7 @@ def make_demo(
     flight = list(
         progress(
             render_images(
-                world, flight_poses(world, num_flight, seed), folder / "flight", seed=5000
+                seed, flight_poses(world, num_flight, seed), folder / "flight", noise_seed=5000
             ),
             "flight",
             num_flight,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
+from trigpoint.poses import format_pose
 from trigpoint.rigid import Rigid3
 
 # Names may hold spaces: the camera begins at the first word followed by the two sizes.
@@ -25,9 +26,11 @@ class Query:
 
 
 def read_names(path: Path) -> list[str]:
-    """Read an image list: a name on each line, in the file's order."""
+    """Read an image list: a name on each line, in the file's order; a query's camera is dropped."""
     names: dict[str, None] = {}
-    for where, name in _read_entries(path):
+    for where, line in _read_entries(path):
+        match = _QUERY.fullmatch(line)
+        name = line if match is None else match["name"]
         _check_new(where, name, names)
         names[name] = None
     return list(names)
@@ -69,20 +72,15 @@ def read_poses(path: Path) -> dict[str, Rigid3]:
 
 def write_poses(path: Path, poses: Mapping[str, Rigid3]) -> None:
     """Write what `read_poses` reads, sorted by name: equal poses give equal bytes."""
-    lines = [format_pose(name, poses[name]) for name in sort_names(poses)]
-    write_atomically(path, "".join(lines))
-
-
-def format_pose(name: str, cam_from_world: Rigid3) -> str:
-    """Format a line `name qw qx qy qz tx ty tz` with every digit of the numbers."""
-    if not is_writable(name) or name.startswith("#"):
-        raise ConfigError(f"the name {name!r} cannot stand in a text file; rename the image")
-    return f"{name} {format_numbers(*cam_from_world.quaternion, *cam_from_world.t)}\n"
+    for name in poses:
+        if not is_writable(name) or name.startswith("#"):
+            raise ConfigError(f"the name {name!r} cannot stand in {path}; rename the image")
+    write_atomically(path, "".join(format_pose(name, poses[name]) for name in sort_names(poses)))
 
 
 def format_numbers(*values: float) -> str:
     """Format numbers with every digit, separated by spaces."""
-    return " ".join(repr(float(value) + 0.0) for value in values)  # + 0.0 makes 0.0 of -0.0
+    return " ".join(repr(float(value)) for value in values)
 
 
 def is_writable(name: str) -> bool:

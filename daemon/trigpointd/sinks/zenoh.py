@@ -68,5 +68,5 @@ class ZenohSink:
 
     def close(self) -> None:
         """Leave the network; subscribers see the token go after the last pose."""
-        self._token.undeclare()
+        self._token.undeclare()  # type: ignore[no-untyped-call]
         self._session.close()  # type: ignore[no-untyped-call]

@@ -55,7 +55,7 @@ def make_room(seed: int = 0) -> World:
     """Furnish a room; another seed gives other textures and things in other places.
 
     It takes seconds and the result is kept, so that each worker of a process pool can call this
-    for every picture rather than be sent the world.
+    for every picture rather than be sent the world. Spawn such workers: OpenCV hangs after a fork.
     """
     rng = np.random.default_rng(seed)
     boxes = _furnish(rng)

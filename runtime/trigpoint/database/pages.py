@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 
 from trigpoint.errors import DatabaseError
 
-NOT_A_MAP = "not a Trigpoint map, or its first pages are damaged"
+NOT_A_MAP = (
+    "not a Trigpoint map, or its first pages are damaged; give a file made by `trigpoint-db build`"
+)
 HEADER_BYTES = 16
 _HEADER = struct.Struct("<QHHHH")  # number, unused, kind, end of pointers, begin of nodes
 _BRANCH, _LEAF, _VALUE, _META = 1, 2, 4, 8

@@ -155,7 +155,7 @@ def encode_image(
 
     stored = HEADER_BYTES + _CRC.size + keypoints.nbytes + descriptors.nbytes
     overhang = stored % 4096 if stored > 4096 else 0
-    num_inline = -(-overhang // 4) if overhang <= _MAX_INLINE_BYTES else 0
+    num_inline = -(-overhang // 4) if overhang <= min(_MAX_INLINE_BYTES, keypoints.nbytes) else 0
     header = _IMAGE.pack(
         *cam_from_world.quaternion,
         *cam_from_world.t,

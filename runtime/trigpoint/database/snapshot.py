@@ -7,6 +7,7 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from weakref import WeakValueDictionary
 
@@ -20,42 +21,36 @@ from trigpoint.frame import ModelIdentity
 MAX_MAP_BYTES = 2**37  # of address space, not of disk; arm64 kernels may offer no more than 2**39
 
 # LMDB wants one environment for a file in a process: readers and a writer share it.
-_environments: WeakValueDictionary[tuple[int, int, int], lmdb.Environment] = WeakValueDictionary()
+_environments: WeakValueDictionary[tuple[int, Path, int, int], lmdb.Environment]
+_environments = WeakValueDictionary()
 
 
 def share_environment(path: Path, fd: int) -> lmdb.Environment:
     """Return this process's environment of an open file; it closes with its last user."""
+    path = path.resolve()  # LMDB names the lock file after the path: one name for all links
     status = os.fstat(fd)
-    key = (os.getpid(), status.st_dev, status.st_ino)
+    key = (os.getpid(), path, status.st_dev, status.st_ino)
     environment = _environments.get(key)
     if environment is None:
+        if any(other[:2] == key[:2] for other in _environments):
+            # The lock file is that of the file which was here before; this one needs its own.
+            path.with_name(path.name + "-lock").unlink(missing_ok=True)
         environment = _environments[key] = _open_environment(path)
     return environment
 
 
 def _open_environment(path: Path) -> lmdb.Environment:
-    # A reader too opens for writing where it may, so that a writer can join it in this process.
+    open_ = partial(
+        lmdb.open, str(path), map_size=MAX_MAP_BYTES, subdir=False, mode=0o644, lib_version=0
+    )
     try:
-        environment = lmdb.open(
-            str(path),
-            map_size=MAX_MAP_BYTES,
-            subdir=False,
-            readonly=not os.access(path, os.W_OK),
-            mode=0o644,
-            lib_version=0,
-        )
+        # A reader too opens for writing where it may, so that a writer can join it in this process.
+        environment = open_(readonly=not os.access(path, os.W_OK))
     except lmdb.Error as error:
         if error.code not in (errno.EACCES, errno.EROFS):
             raise
-        # Nobody may make a lock file here: read without one, and see `Snapshot.is_kept`.
-        return lmdb.open(
-            str(path),
-            map_size=MAX_MAP_BYTES,
-            subdir=False,
-            readonly=True,
-            lock=False,
-            lib_version=0,
-        )
+        # No lock file can be made here: read without one, and see `Snapshot.require_kept`.
+        return open_(readonly=True, lock=False)
     environment.reader_check()  # frees what readers that died still hold
     return environment
 
@@ -73,6 +68,8 @@ def reporting(path: Path) -> Iterator[None]:
         raise DatabaseError(f"{path}: {error}") from error
     except FileNotFoundError as error:
         raise DatabaseError(f"no such map: {path}; `trigpoint-db build` makes one") from error
+    except PermissionError as error:
+        raise DatabaseError(f"{path}: permission denied; change its owner or its mode") from error
     except OSError as error:
         raise DatabaseError(f"{path}: {error.strerror}") from error
     except lmdb.InvalidError as error:
@@ -87,7 +84,7 @@ class Snapshot:
     def __init__(self, path: Path, model: ModelIdentity | None = None) -> None:
         with ExitStack() as stack:
             if not stat.S_ISREG(path.stat().st_mode):
-                raise DatabaseError("not a file; a map is one")
+                raise DatabaseError("not a regular file; give the path of a map file")
             self._fd = os.open(path, os.O_RDONLY)
             stack.callback(os.close, self._fd)
             status = os.fstat(self._fd)
@@ -103,7 +100,7 @@ class Snapshot:
             if self._txn.get(schema.METADATA_KEY) is None:
                 raise DatabaseError(NOT_A_MAP)
             self.metadata = schema.Metadata.decode(self.get(schema.METADATA_KEY))
-            if model not in (None, self.metadata.model):
+            if model is not None and model != self.metadata.model:
                 raise DatabaseError(
                     f"made with {_describe(self.metadata.model)}, not with {_describe(model)}; "
                     "rebuild it with `trigpoint-db build`"
@@ -117,7 +114,10 @@ class Snapshot:
             if meta.commit == txn.id():
                 return txn, meta
             txn.abort()  # a writer has committed twice since
-        raise DamageError("its first pages contradict each other")
+        raise DatabaseError(
+            "its lock file belongs to a map that was here before and is still in use, or its first "
+            "pages are damaged; remove the lock file"
+        )
 
     def get(self, key: bytes) -> memoryview:
         """Return a value where it lies; its checksum is compared the first time."""
@@ -145,8 +145,8 @@ class Snapshot:
             return
         if self._environment.info()["last_txnid"] > self._txn.id() + 1:
             raise DatabaseError(
-                "has changed since, and as no lock file can be made beside it nothing kept "
-                "this snapshot; refresh it"
+                "has changed twice since this snapshot, and nothing kept that, as no lock file "
+                "can be made beside the map; refresh the reader"
             )
 
     def close(self) -> None:

@@ -153,7 +153,8 @@ class MapWriter:
             except lmdb.Error as error:
                 self.close()
                 raise DatabaseError(
-                    f"cannot be written: {error.reason}; what was committed is kept"
+                    f"cannot be written: {error.reason}; what was committed is kept, "
+                    "so free disk space if that is it, and add the rest again"
                 ) from error
 
     def _put(self, txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:

@@ -103,7 +103,10 @@ def _opencv(points_a: Array, points_b: Array, max_error: float) -> Rigid3 | None
         return None
     _, R, t, _ = cv2.recoverPose(E, points_a[kept], points_b[kept], np.eye(3))
     return refine_relative_pose(
-        Rigid3(np.asarray(R), np.asarray(t, np.float64).ravel()), points_a, points_b, max_error=max_error
+        Rigid3(np.asarray(R), np.asarray(t, np.float64).ravel()),
+        points_a,
+        points_b,
+        max_error=max_error,
     )
 
 

@@ -186,8 +186,7 @@ def triangulate(
         g = np.where(better[:, None], new_g, g)
         cost = np.minimum(cost, new_cost)
         size = np.where(better, 1.0, size / 2)
-    covariance: Array = np.linalg.inv(regular(H))
-    return X, covariance
+    return X, np.linalg.inv(regular(H)).astype(np.float64, copy=False)
 
 
 def triangulate_robust(

@@ -1,0 +1,89 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trigpoint.errors import ConfigError
+from trigpointd.config import load_config
+
+MINIMAL = """
+map = "place.tpmap"
+[source]
+type = "mcap"
+path = "flight.mcap"
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "trigpointd.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_minimal_file_is_enough_and_paths_are_relative_to_it(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path, MINIMAL))
+    assert config.map == tmp_path / "place.tpmap"
+    assert config.source.path == tmp_path / "flight.mcap"
+    assert config.localizer.num_anchors == 20
+    assert config.zenoh is None
+    np.testing.assert_array_equal(config.camera.body_from_camera.R, np.eye(3))
+
+
+def test_every_table_is_read(tmp_path: Path) -> None:
+    text = (
+        MINIMAL
+        + """
+rate = 2.0
+[camera]
+position_m = [1, 2, 3]
+rotation_wxyz = [0.5, -0.5, 0.5, -0.5]
+[model]
+num_threads = 1
+[localizer]
+num_anchors = 50
+generator = "anchor_pairs"
+[zenoh]
+mode = "client"
+connect = ["tcp/127.0.0.1:7447"]
+[log]
+path = "/var/log/trigpoint.mcap"
+"""
+    )
+    config = load_config(write(tmp_path, text))
+    assert config.source.rate == 2.0
+    assert config.localizer.num_anchors == 50
+    assert config.log is not None
+    assert config.log.path == Path("/var/log/trigpoint.mcap")
+    # The camera's z axis, ahead, is the body's x axis.
+    np.testing.assert_allclose(config.camera.body_from_camera.R @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (MINIMAL.replace("map =", "mpa ="), "unknown key 'mpa'; did you mean 'map'"),
+        (MINIMAL + "rat = 1", "unknown key 'source.rat'; did you mean 'rate'"),
+        (MINIMAL + "[localizer]\nnum_anchor = 9", "did you mean 'num_anchors'"),
+        (MINIMAL + "[zenho]", "unknown key 'zenho'; did you mean 'zenoh'"),
+        ("map = 'a'", "'source' is missing"),
+        (MINIMAL + "[localizer]\nnum_anchors = 1", "num_anchors must be at least 2"),
+        (MINIMAL + "[localizer]\nmin_inliers = -3", "min_inliers must be positive"),
+        (MINIMAL + "[localizer]\nnum_anchors = 'x'", "'localizer.num_anchors': .*valid integer"),
+        (MINIMAL + "[camera]\nrotation_wxyz = [1, 1, 0, 0]", "unit quaternion"),
+        (MINIMAL.replace("mcap\"\npath", "video\"\npath"), "'source.type': Input should be 'mcap'"),
+        ("base_key = '/x/'\n" + MINIMAL, "'base_key'"),
+        (MINIMAL + "rate = nan", "'source.rate'"),
+        ("map = ", "is not TOML"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_config(path)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"cannot read .*: No such file"):
+        load_config(tmp_path / "none.toml")

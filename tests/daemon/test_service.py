@@ -1,0 +1,248 @@
+"""The daemon as a process of its own: real signals, a real Zenoh session on loopback."""
+
+import contextlib
+import json
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import zenoh
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
+from mcap_ros2.decoder import DecoderFactory as RosDecoders
+from rosbags.typesys import Stores, get_typestore
+
+from tests.conftest import Demo
+from trigpoint.camera import Camera
+from trigpoint.rigid import Rigid3, rotation_angle
+from trigpoint_db.poses import read_poses
+from trigpoint_db.recording import RecordedImage, write_recording
+
+TIMEOUT_S = 60
+
+
+def command(program: str, *arguments: object) -> list[str]:
+    return [sys.executable, "-m", f"{program}.cli", *map(str, arguments)]
+
+
+def run(program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(program, *arguments), capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+    )
+
+
+def write_config(folder: Path, demo: Demo, *, port: int | None = None, more: str = "") -> Path:
+    zenoh_table = "" if port is None else f"""
+[zenoh]
+connect = ["tcp/127.0.0.1:{port}"]
+multicast_scouting = false
+wait_for_subscriber_s = 20
+"""  # fmt: skip
+    path = folder / "trigpointd.toml"
+    path.write_text(f"""
+map = "{demo.map}"
+base_key = "trigpoint/test"
+[camera]
+position_m = [0.12, 0.0, 0.03]
+rotation_wxyz = [0.5, -0.5, 0.5, -0.5]
+[log]
+path = "log.mcap"
+{zenoh_table}
+[source]
+type = "mcap"
+path = "{demo.recording}"
+{more}
+""")
+    return path
+
+
+@contextlib.contextmanager
+def subscriber(port: int) -> Iterator[dict[str, list[zenoh.Sample]]]:
+    """Collect what arrives, by the last part of the key."""
+    settings = zenoh.Config()
+    settings.insert_json5("listen/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
+    settings.insert_json5("scouting/multicast/enabled", "false")
+    samples: dict[str, list[zenoh.Sample]] = {"pose": [], "status": [], "alive": []}
+
+    def collect(sample: zenoh.Sample) -> None:
+        samples[str(sample.key_expr).rsplit("/", 1)[1]].append(sample)
+
+    with zenoh.open(settings) as session:
+        session.declare_subscriber("trigpoint/test/*", collect)
+        session.liveliness().declare_subscriber("trigpoint/test/alive", collect)
+        yield samples
+
+
+def test_a_subscriber_receives_every_pose_and_status(demo: Demo, tmp_path: Path, port: int) -> None:
+    with subscriber(port) as samples:
+        done = run("trigpointd", "run", "--config", write_config(tmp_path, demo, port=port))
+        assert done.returncode == 0, done.stderr
+    statuses = [json.loads(sample.payload.to_bytes()) for sample in samples["status"]]
+    localized = [status for status in statuses if status["status"] == "LOCALIZED"]
+    assert len(statuses) == 16
+    assert len(localized) >= 15
+    assert [status["time_ns"] for status in statuses] == sorted(s["time_ns"] for s in statuses)
+    assert len(samples["pose"]) == len(localized)
+    assert [sample.kind for sample in samples["alive"]] == [
+        zenoh.SampleKind.PUT,
+        zenoh.SampleKind.DELETE,
+    ]
+
+    truth = read_poses(demo.truth)  # body_from_world
+    decode = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
+    for sample, status in zip(samples["pose"], localized, strict=True):
+        assert str(sample.encoding) == (
+            "application/cdr;geometry_msgs/msg/PoseWithCovarianceStamped"
+        )
+        message: Any = decode(
+            sample.payload.to_bytes(), "geometry_msgs/msg/PoseWithCovarianceStamped"
+        )
+        time_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        assert time_ns == status["time_ns"]
+        assert message.header.frame_id == "map"
+        p, q = message.pose.pose.position, message.pose.pose.orientation
+        world_from_body = Rigid3.from_quaternion([q.w, q.x, q.y, q.z], [p.x, p.y, p.z])
+        expected = truth[str(time_ns)].inverse()
+        assert np.linalg.norm(world_from_body.t - expected.t) < 0.05
+        assert np.degrees(rotation_angle(world_from_body.R @ expected.R.T)) < 1.0
+        covariance = message.pose.covariance.reshape(6, 6)
+        np.testing.assert_allclose(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance)[0] > 0
+
+
+def test_the_log_opens_with_independent_readers_and_replays(demo: Demo, tmp_path: Path) -> None:
+    done = run("trigpointd", "run", "--config", write_config(tmp_path, demo))
+    assert done.returncode == 0, done.stderr
+    log = tmp_path / "log.mcap"
+    with log.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[ProtobufDecoders(), RosDecoders()])
+        topics = [c.topic for c in reader.get_summary().channels.values()]  # type: ignore[union-attr]
+        assert sorted(topics) == [
+            "/camera/calibration", "/camera/image", "trigpoint/test/pose", "trigpoint/test/status",
+        ]  # fmt: skip
+        images = list(reader.iter_decoded_messages(topics=["/camera/image"]))
+        poses = list(reader.iter_decoded_messages(topics=["trigpoint/test/pose"]))
+    assert len(images) == 16
+    assert len(poses) >= 15
+    assert poses[0].decoded_message.pose.pose.orientation.w is not None
+    for recording, out in ((demo.recording, "a.txt"), (log, "b.txt")):
+        done = run("trigpointd", "replay", recording, "--map", demo.map, "--poses", tmp_path / out)
+        assert done.returncode == 0, done.stderr
+    assert (tmp_path / "a.txt").read_bytes() == (tmp_path / "b.txt").read_bytes()
+
+
+def test_the_same_replay_twice_gives_the_same_bytes(demo: Demo, tmp_path: Path) -> None:
+    texts = []
+    for name in ("first.txt", "second.txt"):
+        done = run(
+            "trigpointd", "replay", demo.recording, "--map", demo.map, "--poses", tmp_path / name
+        )
+        assert done.returncode == 0, done.stderr
+        texts.append((tmp_path / name).read_bytes())
+    assert texts[0] == texts[1]
+    assert texts[0].count(b"\n") >= 15
+
+
+def wait_for_frames(log: Path, process: subprocess.Popen[str]) -> None:
+    """Return once the daemon has written frames to its log."""
+    for line in process.stderr or ():
+        if "localizing" in line:
+            break
+    while not log.exists() or log.stat().st_size < 600_000:
+        assert process.poll() is None
+
+
+def test_sigterm_ends_it_in_order(demo: Demo, tmp_path: Path) -> None:
+    config = write_config(tmp_path, demo, more="rate = 0.2")
+    with subprocess.Popen(
+        command("trigpointd", "run", "--config", config), stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if "localizing" in line:
+                break
+        process.send_signal(signal.SIGTERM)
+        rest = process.stderr.read()
+        assert process.wait(TIMEOUT_S) == 0
+    assert "stopping" in rest
+    with (tmp_path / "log.mcap").open("rb") as stream:
+        assert make_reader(stream).get_summary() is not None  # it was closed properly
+
+
+def test_after_kill_9_the_log_plays_and_the_map_verifies(demo: Demo, tmp_path: Path) -> None:
+    config = write_config(tmp_path, demo, more="rate = 4.0")
+    log = tmp_path / "log.mcap"
+    with subprocess.Popen(
+        command("trigpointd", "run", "--config", config), stderr=subprocess.PIPE, text=True
+    ) as process:
+        wait_for_frames(log, process)
+        process.kill()
+    done = run(
+        "trigpointd", "replay", log, "--map", demo.map, "--poses", tmp_path / "recovered.txt"
+    )
+    assert done.returncode == 0, done.stderr
+    recovered = read_poses(tmp_path / "recovered.txt")
+    assert 1 <= len(recovered) <= 16
+    done = run("trigpoint_db", "verify", demo.map)
+    assert done.returncode == 0, done.stdout
+
+
+def test_a_corrupt_image_in_a_recording_does_not_stop_the_stream(
+    demo: Demo, tmp_path: Path
+) -> None:
+    images = sorted((demo.folder / "flight").glob("*.jpg"))[:4]
+    (tmp_path / "bad.jpg").write_bytes(images[1].read_bytes()[:5000])
+    dark = np.zeros((480, 640), np.uint8)
+    cv2.imwrite(str(tmp_path / "dark.png"), dark)
+    paths = [images[0], tmp_path / "bad.jpg", images[2], tmp_path / "dark.png", images[3]]
+    camera = Camera("OPENCV", 640, 480, (460, 460, 319.5, 239.5, -0.08, 0.02, 0.001, -0.0005))
+    write_recording(tmp_path / "damaged.mcap", [RecordedImage(path, camera) for path in paths])
+    done = run("trigpointd", "replay", tmp_path / "damaged.mcap", "--map", demo.map)
+    assert done.returncode == 0, done.stderr
+    assert "1 BAD_FRAME, 3 LOCALIZED, 1 TOO_DARK, 0 dropped" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"map": "nowhere.tpmap"}, "nowhere.tpmap"),
+        ({"recording": "nowhere.mcap"}, "nowhere.mcap"),
+    ],
+)
+def test_missing_files_are_one_line_and_exit_1(
+    demo: Demo, tmp_path: Path, change: dict[str, str], message: str
+) -> None:
+    files = {"map": demo.map, "recording": demo.recording, **change}
+    done = run("trigpointd", "replay", files["recording"], "--map", files["map"])
+    assert done.returncode == 1
+    assert done.stderr.startswith("trigpointd: ")
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_port_in_use_is_one_line_and_exit_1(demo: Demo, tmp_path: Path, port: int) -> None:
+    config = write_config(tmp_path, demo)
+    config.write_text(config.read_text() + f"[zenoh]\nlisten = ['tcp/127.0.0.1:{port}']\n")
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", port))
+        listener.listen()
+        done = run("trigpointd", "run", "--config", config)
+    assert done.returncode == 1
+    assert f"cannot open a Zenoh session on tcp/127.0.0.1:{port}" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_check_config_opens_what_is_named(demo: Demo, tmp_path: Path) -> None:
+    config = write_config(tmp_path, demo)
+    assert run("trigpointd", "check-config", config).returncode == 0
+    config.write_text(config.read_text().replace("map.tpmap", "nap.tpmap"))
+    done = run("trigpointd", "check-config", config)
+    assert done.returncode == 1
+    assert "nap.tpmap" in done.stderr

@@ -1,0 +1,462 @@
+"""The map against known contents. Run as a program, this file is the other process of its tests."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from trigpoint.camera import PARAMETERS, Camera
+from trigpoint.database import schema
+from trigpoint.database.reader import MapReader
+from trigpoint.database.writer import MapWriter
+from trigpoint.errors import DatabaseError
+from trigpoint.frame import LocalFeatures, ModelIdentity
+from trigpoint.rigid import Rigid3, rotation_from_vector
+
+MODEL = ModelIdentity("test", "0" * 64, descriptor_dim=16, global_dim=32)
+CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 319.5, 239.5))
+
+
+def unit(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
+    normalised = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return normalised.astype(np.float32)
+
+
+def make_features(
+    seed: int, num_keypoints: int = 40, model: ModelIdentity = MODEL, camera: Camera = CAMERA
+) -> LocalFeatures:
+    rng = np.random.default_rng(seed)
+    corner = np.array([camera.width, camera.height])
+    # Bounded, so that no number of a descriptor is clipped.
+    numbers = rng.uniform(-1, 1, (num_keypoints, model.descriptor_dim))
+    return LocalFeatures(
+        keypoints=(rng.random((num_keypoints, 2)) * corner - 0.5).astype(np.float32),
+        descriptors=unit(numbers),
+        scores=np.sort(rng.random(num_keypoints).astype(np.float32))[::-1],
+        global_descriptor=unit(rng.standard_normal(model.global_dim)),
+    )
+
+
+def make_pose(seed: int) -> Rigid3:
+    rng = np.random.default_rng(seed)
+    return Rigid3(rotation_from_vector(rng.standard_normal(3)), rng.normal(0, 100, 3))
+
+
+def add(writer: MapWriter, index: int, **changes: Any) -> int:
+    """Add the image that belongs at an index, or a changed one."""
+    image = {
+        "name": f"folder/{index}.png",
+        "camera": CAMERA,
+        "cam_from_world": make_pose(index),
+        "features": make_features(index),
+    }
+    return writer.add(**{**image, **changes})
+
+
+def make_map(path: Path, num_images: int) -> Path:
+    with MapWriter.create(path, MODEL) as writer:
+        for index in range(num_images):
+            add(writer, index)
+    return path
+
+
+def require_image(reader: MapReader, index: int) -> None:
+    """The image that `add` put at an index is there."""
+    anchor, features = reader.anchor(index), make_features(index)
+    assert anchor.name == f"folder/{index}.png"
+    np.testing.assert_allclose(anchor.cam_from_world.t, make_pose(index).t, rtol=1e-12)
+    np.testing.assert_allclose(anchor.keypoints, features.keypoints, atol=0.01)
+    np.testing.assert_allclose(anchor.descriptors, features.descriptors, atol=0.02)
+
+
+@contextmanager
+def other_process(*words: str | Path) -> Iterator[subprocess.Popen[str]]:
+    """Run `main` below with these words."""
+    command = [sys.executable, "-m", "tests.unit.test_database", *map(str, words)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(
+        command,
+        cwd=Path(__file__).parents[2],
+        env=environment,
+        text=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def read_line(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+def tell(process: subprocess.Popen[str], line: str) -> None:
+    assert process.stdin is not None
+    print(line, file=process.stdin, flush=True)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    num_keypoints=st.integers(0, 200),
+    dim=st.sampled_from([8, 16, 64]),
+    size=st.tuples(st.integers(1, 5000), st.integers(1, 5000)),
+)
+@example(seed=1, num_keypoints=1024, dim=64, size=(640, 480))  # fills whole pages
+def test_an_image_comes_back_within_its_quantisation(
+    tmp_path_factory: pytest.TempPathFactory,
+    seed: int,
+    num_keypoints: int,
+    dim: int,
+    size: tuple[int, int],
+) -> None:
+    model = replace(MODEL, descriptor_dim=dim)
+    camera = Camera("OPENCV", *size, tuple(np.random.default_rng(seed).uniform(0.1, 900, 8)))
+    features, pose = make_features(seed, num_keypoints, model, camera), make_pose(seed)
+    path = tmp_path_factory.mktemp("map") / "a.tpmap"
+    with MapWriter.create(path, model) as writer:
+        assert writer.add("größer/1.png", camera, pose, features) == 0
+    with MapReader.open(path, model) as reader:
+        anchor = reader.anchor(0)
+        assert reader.verify() == []
+    assert (anchor.name, anchor.camera) == ("größer/1.png", camera)
+    np.testing.assert_allclose(anchor.cam_from_world.R, pose.R, atol=1e-14)
+    np.testing.assert_array_equal(anchor.cam_from_world.t, pose.t)
+    half_step_px = max(size) / 65_535 / 2
+    assert anchor.keypoints.dtype == anchor.descriptors.dtype == np.float32
+    np.testing.assert_allclose(anchor.keypoints, features.keypoints, atol=1.05 * half_step_px)
+    assert anchor.descriptors.shape == features.descriptors.shape
+    # Half a step of 4 / (127 sqrt(D)) in each of D numbers turns a unit vector by 2 / 127 at most.
+    error = np.linalg.norm(anchor.descriptors - features.descriptors, axis=1)
+    assert (error <= 2 / 127 * 1.01).all()
+
+
+@pytest.mark.parametrize("model", PARAMETERS)
+def test_every_camera_model_comes_back_exactly(tmp_path: Path, model: str) -> None:
+    params = tuple(0.1 + 7 * i / 3 for i in range(len(PARAMETERS[model])))
+    camera = Camera(model, 640, 480, params)
+    with MapWriter.create(tmp_path / "a.tpmap", MODEL) as writer:
+        add(writer, 0, camera=camera)
+    with MapReader.open(tmp_path / "a.tpmap") as reader:
+        assert reader.anchor(0).camera == camera
+
+
+def test_an_image_of_1024_keypoints_takes_less_than_72_kilobytes(tmp_path: Path) -> None:
+    model = replace(MODEL, descriptor_dim=64, global_dim=512)
+    with MapWriter.create(tmp_path / "a.tpmap", model) as writer:
+        for index in range(24):
+            add(writer, index, features=make_features(index, 1024, model))
+    assert (tmp_path / "a.tpmap").stat().st_size / 24 < 72_000
+
+
+def test_images_added_after_reopening_follow_the_others(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 250)
+    for first, last in ((250, 260), (260, 300)):  # across the end of a retrieval block
+        with MapWriter.open(path, MODEL) as writer:
+            assert [add(writer, index) for index in range(first, last)] == [*range(first, last)]
+    with MapReader.open(path) as reader:
+        assert reader.verify() == []
+        assert reader.names() == [f"folder/{index}.png" for index in range(300)]
+        for index in (0, 249, 250, 256, 299):
+            require_image(reader, index)
+            found, similarities = reader.search(make_features(index).global_descriptor, 1)
+            assert found.tolist() == [index]
+            np.testing.assert_allclose(similarities, 1, atol=1e-3)
+
+
+def test_the_generation_rises_with_each_commit_that_changes_something(tmp_path: Path) -> None:
+    path = tmp_path / "a.tpmap"
+    with MapWriter.create(path, MODEL) as writer, MapReader.open(path) as reader:
+        generations = [reader.generation]
+        for index in (0, None, 1):
+            if index is not None:
+                add(writer, index)
+            writer.commit()
+            reader.refresh()
+            generations.append(reader.generation)
+        assert generations == [0, 1, 1, 2]
+        assert (reader.model, len(reader), len(writer)) == (MODEL, 2, 2)
+
+
+def test_an_exception_drops_what_was_not_committed(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 3)
+    with suppress(KeyboardInterrupt), MapWriter.open(path, MODEL) as writer:
+        add(writer, 3)
+        writer.commit()
+        add(writer, 4)
+        raise KeyboardInterrupt
+    with MapReader.open(path) as reader:
+        assert (len(reader), reader.verify()) == (4, [])
+
+
+def changed(**arrays: NDArray[np.float32]) -> LocalFeatures:
+    return replace(make_features(9), **arrays)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"name": "folder/0.png"}, "holds an image 'folder/0.png' already"),
+        ({"name": ""}, "a name of 0 bytes"),
+        ({"name": "ä" * 251}, "a name of 502 bytes"),
+        ({"name": "\udcff"}, "not valid Unicode"),
+        ({"cam_from_world": Rigid3(np.eye(3), np.array([0, np.nan, 0]))}, "not finite"),
+        ({"cam_from_world": Rigid3(-np.eye(3), np.zeros(3))}, "R is no rotation"),
+        ({"cam_from_world": Rigid3.stack([make_pose(0)])}, "one pose an image"),
+        ({"features": make_features(9, model=replace(MODEL, descriptor_dim=8))}, "descriptors"),
+        ({"features": make_features(9, model=replace(MODEL, global_dim=8))}, "global_descriptor"),
+        ({"features": changed(keypoints=np.zeros((39, 2), np.float32))}, r"\(39, 16\)"),
+        ({"features": changed(keypoints=np.full((40, 2), 480, np.float32))}, "outside"),
+        ({"features": changed(keypoints=np.full((40, 2), -0.6, np.float32))}, "outside"),
+        ({"features": changed(descriptors=np.full((40, 16), np.nan, np.float32))}, "not finite"),
+        ({"features": make_features(9, schema.MAX_KEYPOINTS + 1)}, "65536 keypoints"),
+    ],
+)
+def test_what_cannot_be_added_is_refused_and_leaves_no_trace(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    path = make_map(tmp_path / "a.tpmap", 1)
+    with MapWriter.open(path, MODEL) as writer:
+        with pytest.raises(DatabaseError, match=message) as caught:
+            add(writer, 9, **changes)
+        assert "\n" not in str(caught.value)
+        assert add(writer, 1) == 1
+    with MapReader.open(path) as reader:
+        assert (reader.names(), reader.verify()) == (["folder/0.png", "folder/1.png"], [])
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), k=st.integers(0, 320))
+def test_search_equals_brute_force_on_the_stored_rows(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, k: int
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "search.tpmap"
+    if not path.exists():
+        make_map(path, 300)
+    stored = [
+        scale * row.astype(np.float64)
+        for scale, row in (
+            schema.quantize_row(make_features(index).global_descriptor) for index in range(300)
+        )
+    ]
+    query = make_features(seed).global_descriptor
+    with MapReader.open(path) as reader:
+        indices, similarities = reader.search(query, k)
+    expected = np.array(stored) @ query.astype(np.float64)
+    best = np.sort(expected)[::-1][:k]
+    assert len(indices) == len(set(indices.tolist())) == min(k, 300)
+    np.testing.assert_allclose(similarities, best, atol=1e-6)
+    np.testing.assert_allclose(expected[indices], best, atol=1e-6)
+
+
+def test_equally_similar_images_come_in_the_order_they_were_added(tmp_path: Path) -> None:
+    twins = {0, 5, 255, 256, 270}
+    with MapWriter.create(tmp_path / "a.tpmap", MODEL) as writer:
+        for index in range(280):
+            add(writer, index, features=make_features(1000 if index in twins else index))
+    with MapReader.open(tmp_path / "a.tpmap") as reader:
+        for k in range(1, 6):
+            found, _ = reader.search(make_features(1000).global_descriptor, k)
+            assert found.tolist() == sorted(twins)[:k]
+
+
+def test_searching_for_another_networks_descriptor_is_an_error(tmp_path: Path) -> None:
+    with MapReader.open(make_map(tmp_path / "a.tpmap", 1)) as reader:
+        for query in (np.zeros(31, np.float32), np.full(32, np.nan, np.float32)):
+            with pytest.raises(DatabaseError, match="global descriptors are"):
+                reader.search(query, 1)
+        with pytest.raises(DatabaseError, match="no image 1 among 1"):
+            reader.anchor(1)
+        with pytest.raises(DatabaseError, match="no image -1 among 1"):
+            reader.cam_from_world(-1)
+
+
+def test_a_reader_keeps_its_snapshot_while_another_process_writes(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 3)
+    with MapReader.open(path) as reader, other_process("add-on-demand", path) as writer:
+        for expected in (4, 5, 6):
+            tell(writer, "add")
+            assert read_line(writer) == "committed"
+            assert len(reader) == expected - 1
+            assert reader.verify() == []
+            assert reader.refresh() is True
+            assert reader.refresh() is False
+            assert len(reader) == expected
+            require_image(reader, expected - 1)
+
+
+def test_readers_and_a_writer_of_one_process_share_the_map(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 2)
+    with (
+        MapReader.open(path) as first,
+        MapWriter.open(path, MODEL) as writer,
+        MapReader.open(path) as second,
+    ):
+        add(writer, 2)
+        assert (first.refresh(), len(second)) == (False, 2)
+        writer.commit()
+        assert (first.refresh(), len(first), len(second)) == (True, 3, 2)
+        assert first.verify() == second.verify() == []
+
+
+def test_a_second_writer_is_turned_away(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 1)
+    with other_process("add-on-demand", path) as writer:
+        tell(writer, "add")
+        read_line(writer)
+        with pytest.raises(DatabaseError, match="another writer has it open"):
+            MapWriter.open(path, MODEL)
+    with MapWriter.open(path, MODEL), pytest.raises(DatabaseError, match="another writer"):
+        MapWriter.open(path, MODEL)
+
+
+def test_killing_a_writer_loses_no_committed_image(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 0)
+    for _ in range(2):
+        with other_process("add-forever", path) as writer:
+            committed = max(int(read_line(writer)) for _ in range(20))
+            writer.send_signal(signal.SIGKILL)
+            assert writer.wait() == -signal.SIGKILL
+        with MapReader.open(path) as reader:
+            assert reader.verify() == []
+            assert len(reader) >= committed
+            for index in range(len(reader)):
+                require_image(reader, index)
+
+
+def test_a_commit_the_disk_refuses_keeps_what_was_committed(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 3)
+    with other_process("fill-the-disk", path) as writer:
+        line = read_line(writer)
+    assert line.startswith(f"{path}: cannot be written: ")
+    with MapReader.open(path) as reader:
+        assert (len(reader), reader.verify()) == (3, [])
+
+
+@pytest.fixture
+def public_folder() -> Iterator[Path]:
+    """A folder that another user can get to; pytest's own are private."""
+    with TemporaryDirectory() as name:
+        Path(name).chmod(0o755)
+        yield Path(name)
+
+
+def test_a_map_in_a_read_only_folder_can_be_read_and_says_when_it_changed(
+    public_folder: Path,
+) -> None:
+    path = make_map(public_folder / "a.tpmap", 3)
+    path.with_name("a.tpmap-lock").unlink()
+    with other_process("read-without-rights", path) as reader:
+        assert read_line(reader) == "3 images"
+        public_folder.chmod(0o755)
+        for task, expected in (("look", "3"), ("look", "changed twice"), ("refresh", "6")):
+            with MapWriter.open(path, MODEL) as writer:
+                add(writer, len(writer))
+            tell(reader, task)
+            assert expected in read_line(reader)
+
+
+def test_a_map_that_may_not_be_read_says_so(public_folder: Path) -> None:
+    path = make_map(public_folder / "a.tpmap", 1)
+    path.chmod(0)
+    with other_process("read-without-rights", path) as reader:
+        assert read_line(reader) == f"{path}: permission denied; change its owner or its mode"
+
+
+def test_a_map_renamed_into_place_is_picked_up(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 2)
+    with MapReader.open(path) as reader:
+        make_map(tmp_path / "new.tpmap", 5).rename(path)
+        assert len(reader) == 2
+        require_image(reader, 1)
+        assert reader.refresh() is True
+        assert len(reader) == 5
+        other = tmp_path / "other.tpmap"
+        MapWriter.create(other, replace(MODEL, name="other")).close()
+        other.rename(path)
+        with pytest.raises(DatabaseError, match="made with model 'other'"):
+            reader.refresh()
+        require_image(reader, 4)
+
+
+def test_what_is_closed_says_so(tmp_path: Path) -> None:
+    writer = MapWriter.create(tmp_path / "a.tpmap", MODEL)
+    reader = MapReader.open(tmp_path / "a.tpmap")
+    for closable in (reader, writer, reader, writer):
+        closable.close()
+    with pytest.raises(DatabaseError, match="this writer is closed"):
+        add(writer, 0)
+    with pytest.raises(DatabaseError, match="this reader is closed"):
+        reader.names()
+
+
+def main(task: str, path: Path) -> None:
+    """Do what a test wants of another process, and say so line by line."""
+    if task == "read-without-rights":
+        read_without_rights(path)
+        return
+    with MapWriter.open(path, MODEL) as writer:
+        if task == "add-forever":
+            while True:
+                for _ in range(3):
+                    add(writer, len(writer))
+                writer.commit()
+                say(len(writer))
+        if task == "fill-the-disk":
+            limit = path.stat().st_size + 8192
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+            for _ in range(20):
+                add(writer, len(writer))
+            try:
+                writer.commit()
+            except DatabaseError as error:
+                say(error)
+        if task == "add-on-demand":
+            for _ in sys.stdin:
+                add(writer, len(writer))
+                writer.commit()
+                say("committed")
+
+
+def read_without_rights(path: Path) -> None:
+    if os.geteuid() == 0:
+        os.setuid(65_534)
+    else:
+        path.parent.chmod(0o555)
+    try:
+        with MapReader.open(path, MODEL) as reader:
+            say(f"{len(reader.names())} images")
+            for line in sys.stdin:
+                if line == "refresh\n":
+                    reader.refresh()
+                try:
+                    say(f"{len(reader.names())} images")
+                except DatabaseError as error:
+                    say(error)
+    except DatabaseError as error:
+        say(error)
+
+
+def say(what: object) -> None:
+    sys.stdout.write(f"{what}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))
