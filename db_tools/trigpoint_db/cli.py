@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
+import threadpoolctl
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -43,6 +45,12 @@ console = Console()
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 Model = Annotated[Path | None, typer.Option(help="A feature network; ours by default.")]
 MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="A .tpmap file.")]
+
+
+@app.callback()
+def _set_up() -> None:
+    # As in the daemon: OpenBLAS's threads spin while they wait for each other.
+    threadpoolctl.threadpool_limits(1, user_api="blas")
 
 
 def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
@@ -118,10 +126,8 @@ def localize(
 def _localize(
     reader: MapReader, network: FeatureModel, queries: list[Query], folder: Path, anchors: int
 ) -> Iterator[Outcome]:
-    from time import perf_counter
-
     options = LocalizerOptions(num_anchors=anchors)
-    localizer = Localizer(network, reader, options, clock=perf_counter)
+    localizer = Localizer(network, reader, options, clock=time.perf_counter)
     yield from track(localize_images(localizer, queries, folder), "localizing", len(queries))
 
 

@@ -1,15 +1,8 @@
-"""The map against known contents. Run as a program, this file is the other process of its tests."""
+"""The map against known contents."""
 
-import os
-import resource
-import signal
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,97 +11,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tests.unit.maps import MODEL, add, make_features, make_map, make_pose, require_image
 from trigpoint.camera import PARAMETERS, Camera
 from trigpoint.database import schema
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import DatabaseError
-from trigpoint.frame import LocalFeatures, ModelIdentity
-from trigpoint.rigid import Rigid3, rotation_from_vector
-
-MODEL = ModelIdentity("test", "0" * 64, descriptor_dim=16, global_dim=32)
-CAMERA = Camera("PINHOLE", 640, 480, (500.0, 510.0, 319.5, 239.5))
-
-
-def unit(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
-    normalised = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return normalised.astype(np.float32)
-
-
-def make_features(
-    seed: int, num_keypoints: int = 40, model: ModelIdentity = MODEL, camera: Camera = CAMERA
-) -> LocalFeatures:
-    rng = np.random.default_rng(seed)
-    corner = np.array([camera.width, camera.height])
-    # Bounded, so that no number of a descriptor is clipped.
-    numbers = rng.uniform(-1, 1, (num_keypoints, model.descriptor_dim))
-    return LocalFeatures(
-        keypoints=(rng.random((num_keypoints, 2)) * corner - 0.5).astype(np.float32),
-        descriptors=unit(numbers),
-        scores=np.sort(rng.random(num_keypoints).astype(np.float32))[::-1],
-        global_descriptor=unit(rng.standard_normal(model.global_dim)),
-    )
-
-
-def make_pose(seed: int) -> Rigid3:
-    rng = np.random.default_rng(seed)
-    return Rigid3(rotation_from_vector(rng.standard_normal(3)), rng.normal(0, 100, 3))
-
-
-def add(writer: MapWriter, index: int, **changes: Any) -> int:
-    """Add the image that belongs at an index, or a changed one."""
-    image = {
-        "name": f"folder/{index}.png",
-        "camera": CAMERA,
-        "cam_from_world": make_pose(index),
-        "features": make_features(index),
-    }
-    return writer.add(**{**image, **changes})
-
-
-def make_map(path: Path, num_images: int) -> Path:
-    with MapWriter.create(path, MODEL) as writer:
-        for index in range(num_images):
-            add(writer, index)
-    return path
-
-
-def require_image(reader: MapReader, index: int) -> None:
-    """The image that `add` put at an index is there."""
-    anchor, features = reader.anchor(index), make_features(index)
-    assert anchor.name == f"folder/{index}.png"
-    np.testing.assert_allclose(anchor.cam_from_world.t, make_pose(index).t, rtol=1e-12)
-    np.testing.assert_allclose(anchor.keypoints, features.keypoints, atol=0.01)
-    np.testing.assert_allclose(anchor.descriptors, features.descriptors, atol=0.02)
-
-
-@contextmanager
-def other_process(*words: str | Path) -> Iterator[subprocess.Popen[str]]:
-    """Run `main` below with these words."""
-    command = [sys.executable, "-m", "tests.unit.test_database", *map(str, words)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen(
-        command,
-        cwd=Path(__file__).parents[2],
-        env=environment,
-        text=True,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-def read_line(process: subprocess.Popen[str]) -> str:
-    assert process.stdout is not None
-    return process.stdout.readline().strip()
-
-
-def tell(process: subprocess.Popen[str], line: str) -> None:
-    assert process.stdin is not None
-    print(line, file=process.stdin, flush=True)
+from trigpoint.frame import LocalFeatures
+from trigpoint.rigid import Rigid3
 
 
 @settings(max_examples=30, deadline=None)
@@ -287,20 +197,6 @@ def test_searching_for_another_networks_descriptor_is_an_error(tmp_path: Path) -
             reader.cam_from_world(-1)
 
 
-def test_a_reader_keeps_its_snapshot_while_another_process_writes(tmp_path: Path) -> None:
-    path = make_map(tmp_path / "a.tpmap", 3)
-    with MapReader.open(path) as reader, other_process("add-on-demand", path) as writer:
-        for expected in (4, 5, 6):
-            tell(writer, "add")
-            assert read_line(writer) == "committed"
-            assert len(reader) == expected - 1
-            assert reader.verify() == []
-            assert reader.refresh() is True
-            assert reader.refresh() is False
-            assert len(reader) == expected
-            require_image(reader, expected - 1)
-
-
 def test_readers_and_a_writer_of_one_process_share_the_map(tmp_path: Path) -> None:
     path = make_map(tmp_path / "a.tpmap", 2)
     with (
@@ -313,70 +209,6 @@ def test_readers_and_a_writer_of_one_process_share_the_map(tmp_path: Path) -> No
         writer.commit()
         assert (first.refresh(), len(first), len(second)) == (True, 3, 2)
         assert first.verify() == second.verify() == []
-
-
-def test_a_second_writer_is_turned_away(tmp_path: Path) -> None:
-    path = make_map(tmp_path / "a.tpmap", 1)
-    with other_process("add-on-demand", path) as writer:
-        tell(writer, "add")
-        read_line(writer)
-        with pytest.raises(DatabaseError, match="another writer has it open"):
-            MapWriter.open(path, MODEL)
-    with MapWriter.open(path, MODEL), pytest.raises(DatabaseError, match="another writer"):
-        MapWriter.open(path, MODEL)
-
-
-def test_killing_a_writer_loses_no_committed_image(tmp_path: Path) -> None:
-    path = make_map(tmp_path / "a.tpmap", 0)
-    for _ in range(2):
-        with other_process("add-forever", path) as writer:
-            committed = max(int(read_line(writer)) for _ in range(20))
-            writer.send_signal(signal.SIGKILL)
-            assert writer.wait() == -signal.SIGKILL
-        with MapReader.open(path) as reader:
-            assert reader.verify() == []
-            assert len(reader) >= committed
-            for index in range(len(reader)):
-                require_image(reader, index)
-
-
-def test_a_commit_the_disk_refuses_keeps_what_was_committed(tmp_path: Path) -> None:
-    path = make_map(tmp_path / "a.tpmap", 3)
-    with other_process("fill-the-disk", path) as writer:
-        line = read_line(writer)
-    assert line.startswith(f"{path}: cannot be written: ")
-    with MapReader.open(path) as reader:
-        assert (len(reader), reader.verify()) == (3, [])
-
-
-@pytest.fixture
-def public_folder() -> Iterator[Path]:
-    """A folder that another user can get to; pytest's own are private."""
-    with TemporaryDirectory() as name:
-        Path(name).chmod(0o755)
-        yield Path(name)
-
-
-def test_a_map_in_a_read_only_folder_can_be_read_and_says_when_it_changed(
-    public_folder: Path,
-) -> None:
-    path = make_map(public_folder / "a.tpmap", 3)
-    path.with_name("a.tpmap-lock").unlink()
-    with other_process("read-without-rights", path) as reader:
-        assert read_line(reader) == "3 images"
-        public_folder.chmod(0o755)
-        for task, expected in (("look", "3"), ("look", "changed twice"), ("refresh", "6")):
-            with MapWriter.open(path, MODEL) as writer:
-                add(writer, len(writer))
-            tell(reader, task)
-            assert expected in read_line(reader)
-
-
-def test_a_map_that_may_not_be_read_says_so(public_folder: Path) -> None:
-    path = make_map(public_folder / "a.tpmap", 1)
-    path.chmod(0)
-    with other_process("read-without-rights", path) as reader:
-        assert read_line(reader) == f"{path}: permission denied; change its owner or its mode"
 
 
 def test_a_map_renamed_into_place_is_picked_up(tmp_path: Path) -> None:
@@ -404,59 +236,3 @@ def test_what_is_closed_says_so(tmp_path: Path) -> None:
         add(writer, 0)
     with pytest.raises(DatabaseError, match="this reader is closed"):
         reader.names()
-
-
-def main(task: str, path: Path) -> None:
-    """Do what a test wants of another process, and say so line by line."""
-    if task == "read-without-rights":
-        read_without_rights(path)
-        return
-    with MapWriter.open(path, MODEL) as writer:
-        if task == "add-forever":
-            while True:
-                for _ in range(3):
-                    add(writer, len(writer))
-                writer.commit()
-                say(len(writer))
-        if task == "fill-the-disk":
-            limit = path.stat().st_size + 8192
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-            for _ in range(20):
-                add(writer, len(writer))
-            try:
-                writer.commit()
-            except DatabaseError as error:
-                say(error)
-        if task == "add-on-demand":
-            for _ in sys.stdin:
-                add(writer, len(writer))
-                writer.commit()
-                say("committed")
-
-
-def read_without_rights(path: Path) -> None:
-    if os.geteuid() == 0:
-        os.setuid(65_534)
-    else:
-        path.parent.chmod(0o555)
-    try:
-        with MapReader.open(path, MODEL) as reader:
-            say(f"{len(reader.names())} images")
-            for line in sys.stdin:
-                if line == "refresh\n":
-                    reader.refresh()
-                try:
-                    say(f"{len(reader.names())} images")
-                except DatabaseError as error:
-                    say(error)
-    except DatabaseError as error:
-        say(error)
-
-
-def say(what: object) -> None:
-    sys.stdout.write(f"{what}\n")
-    sys.stdout.flush()
-
-
-if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]))
