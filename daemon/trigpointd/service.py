@@ -65,7 +65,6 @@ def run(config: Config, extra_sinks: Sequence[Sink] = ()) -> Totals:
             wait_s = config.zenoh.wait_for_subscriber_s
             if wait_s > 0 and not zenoh.wait_for_subscriber(wait_s):
                 _log.warning("nobody has subscribed to the poses in %g s; going on", wait_s)
-        _log.info("localizing %s against %s", config.source.path, config.map)
         return asyncio.run(_run_until_signal(source, pipeline, sinks))
 
 
@@ -90,6 +89,7 @@ async def _run_until_signal(source: Source, pipeline: Pipeline, sinks: Sequence[
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     notify("READY=1")
+    _log.info("localizing")
     try:
         return await serve(source, pipeline, sinks, stop)
     finally:

@@ -34,7 +34,7 @@ def peak(
     x: float, y: float, height: float, shape: tuple[int, int] = (40, 50)
 ) -> NDArray[np.float32]:
     v, u = np.mgrid[: shape[0], : shape[1]]
-    return (height - 0.1 * ((u - x) ** 2 + (v - y) ** 2)).astype(np.float32)
+    return np.asarray(height - 0.1 * ((u - x) ** 2 + (v - y) ** 2), np.float32)
 
 
 def test_a_parabola_is_found_to_a_hundredth_of_a_pixel() -> None:
