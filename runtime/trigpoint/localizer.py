@@ -97,6 +97,9 @@ class Localizer:
             anchors = [self.map.anchor(int(index)) for index in indices]
         trace.note(num_anchors=len(anchors), anchors=tuple(anchor.name for anchor in anchors))
 
+        if len(anchors) < 2:
+            return trace.lost(Reason.FEW_ANCHORS, "the map holds a single image")
+
         with trace.stage("matching"):
             query = match_anchors(frame, features, anchors, self.model.contract.long_side_px)
         trace.note(num_matches=len(query.tracks))

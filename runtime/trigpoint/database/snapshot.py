@@ -94,6 +94,7 @@ class Snapshot:
             self._environment = share_environment(path, self._fd)
             self._txn, meta = self._begin()
             stack.callback(self._txn.abort)
+            self._is_kept = self._environment.info()["num_readers"] > 0
             self._tree = Tree(self._fd, meta)
             self._checked: set[bytes] = set()
             self._tree.check(schema.METADATA_KEY)
@@ -138,12 +139,13 @@ class Snapshot:
     def require_kept(self) -> None:
         """Raise DatabaseError if a writer may have reused pages of this snapshot.
 
-        With a lock file it cannot. Without one, pages that a commit left over are reused from the
-        second commit after it on.
+        While the lock file counts this reader, it cannot. Without one, pages that a commit left
+        over are reused from the second commit after it on.
         """
-        if self._environment.flags()["lock"]:
+        if self._is_kept:
             return
-        if self._environment.info()["last_txnid"] > self._txn.id() + 1:
+        newest = max(read_meta(self._fd, slot).commit for slot in (0, 1))
+        if newest > self._txn.id() + 1:
             raise DatabaseError(
                 "has changed twice since this snapshot, and nothing kept that, as no lock file "
                 "can be made beside the map; refresh the reader"

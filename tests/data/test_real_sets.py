@@ -1,0 +1,80 @@
+"""Real images with reference poses: build, localize, evaluate, by the commands of the README."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import DATA
+
+pytestmark = pytest.mark.skipif(
+    not DATA.is_dir(), reason=f"needs the posed images in {DATA}, which are not ours to ship"
+)
+
+
+def trigpoint_db(*arguments: object) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "trigpoint_db.cli", *map(str, arguments)],
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "split", "min_localized", "max_median_m", "max_median_deg"),
+    [
+        ("7scenes_redkitchen", "", 29, 0.003, 0.1),
+        ("7scenes_redkitchen", "_block", 44, 0.010, 0.4),
+        # Units are arbitrary here: the camera centers spread 3.06 and 3.66.
+        ("fox", "", 10, 0.005, 0.06),
+        ("fox", "_block", 15, 0.005, 0.06),
+        ("tnt_truck", "", 25, 0.004, 0.06),
+        ("tnt_truck", "_block", 30, 0.010, 0.2),
+    ],
+)
+def test_real_queries_are_localized(
+    tmp_path: Path,
+    name: str,
+    split: str,
+    min_localized: int,
+    max_median_m: float,
+    max_median_deg: float,
+) -> None:
+    folder = DATA / name
+    queries = folder / f"queries{split}.txt"
+    map_, poses, results = tmp_path / "m.tpmap", tmp_path / "poses.txt", tmp_path / "results.jsonl"
+    trigpoint_db(
+        "build", map_, "--colmap", folder / "sparse", "--images", folder / "images",
+        "--list", folder / f"map{split}.txt",
+    )  # fmt: skip
+    trigpoint_db(
+        "localize", map_, "--images", folder / "images", "--queries", queries,
+        "--poses", poses, "--results", results,
+    )  # fmt: skip
+    report: dict[str, Any] = json.loads(
+        trigpoint_db(
+            "evaluate", "--poses", poses, "--truth", folder, "--queries", queries, "--json"
+        )
+    )
+    assert report["num_localized"] >= min_localized
+    assert report["median_position_m"] <= max_median_m
+    assert report["median_rotation_deg"] <= max_median_deg
+    lines = [json.loads(line) for line in results.read_text().splitlines()]
+    assert len(lines) == report["num_queries"]
+    assert sum(line["status"] == "LOCALIZED" for line in lines) == report["num_localized"]
+    assert all(line["stage_ms"]["features"] > 0 for line in lines)
+
+
+def test_frames_of_another_place_are_refused(tmp_path: Path) -> None:
+    kitchen, truck = DATA / "7scenes_redkitchen", DATA / "tnt_truck"
+    map_, poses = tmp_path / "m.tpmap", tmp_path / "poses.txt"
+    trigpoint_db("build", map_, "--colmap", kitchen / "sparse", "--images", kitchen / "images")
+    trigpoint_db(
+        "localize", map_, "--images", truck / "images", "--queries", truck / "queries.txt",
+        "--poses", poses,
+    )  # fmt: skip
+    assert poses.read_text() == ""

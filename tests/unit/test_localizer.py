@@ -1,0 +1,157 @@
+"""The pipeline on the rendered room: what is found, what is refused, and why."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import Demo
+from tests.unit.scenes import generator
+from trigpoint.database.reader import MapReader
+from trigpoint.database.writer import MapWriter
+from trigpoint.errors import ConfigError
+from trigpoint.frame import Frame, Localized, Lost, Reason, describe
+from trigpoint.images import read_gray
+from trigpoint.localizer import Localizer
+from trigpoint.models.features import FeatureModel
+from trigpoint.rigid import Rigid3, rotation_angle
+from trigpoint.stages import LocalizerOptions, average_poses
+from trigpoint_db.demo import BODY_FROM_CAMERA, CAMERA
+from trigpoint_db.poses import read_poses
+
+
+@pytest.fixture(scope="module")
+def reader(demo: Demo, model: FeatureModel) -> Iterator[MapReader]:
+    with MapReader.open(demo.map, model.identity) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def flight(demo: Demo) -> list[tuple[Frame, Rigid3]]:
+    """Some frames with their true cam_from_world."""
+    truth = list(read_poses(demo.truth).values())
+    paths = sorted((demo.folder / "flight").glob("*.jpg"))
+    return [
+        (Frame(read_gray(paths[i]), CAMERA), BODY_FROM_CAMERA.inverse() @ truth[i])
+        for i in (0, 5, 10)
+    ]
+
+
+@pytest.mark.parametrize("generator_name", ["best", "anchor_pairs", "latent_points"])
+def test_frames_are_localized_by_either_generator(
+    model: FeatureModel,
+    reader: MapReader,
+    flight: list[tuple[Frame, Rigid3]],
+    generator_name: str,
+) -> None:
+    options = LocalizerOptions(generator=generator_name)  # type: ignore[arg-type]
+    localizer = Localizer(model, reader, options)
+    for frame, truth in flight:
+        result = localizer.localize(frame)
+        assert isinstance(result, Localized), describe(result)
+        assert np.linalg.norm(result.cam_from_world.center - truth.center) < 0.02
+        assert np.degrees(rotation_angle(result.cam_from_world.R @ truth.R.T)) < 0.3
+        assert np.linalg.eigvalsh(result.covariance)[0] > 0
+        if generator_name != "best":
+            assert result.statistics.generator == generator_name
+        assert (result.statistics.num_consistent_anchors >= 2) == (generator_name == "anchor_pairs")
+
+
+def test_the_same_frame_gives_the_same_pose(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    first, second = (Localizer(model, reader).localize(flight[0][0]) for _ in range(2))
+    assert isinstance(first, Localized)
+    assert isinstance(second, Localized)
+    np.testing.assert_array_equal(first.cam_from_world.t, second.cam_from_world.t)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+
+
+def test_stage_times_are_measured_with_the_callers_clock(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    ticks = iter(range(1000))
+    result = Localizer(model, reader, clock=lambda: float(next(ticks))).localize(flight[0][0])
+    assert set(result.statistics.stage_ms.values()) == {1000.0}
+    assert list(result.statistics.stage_ms)[:3] == ["features", "retrieval", "matching"]
+    untimed = Localizer(model, reader).localize(flight[0][0])
+    assert untimed.statistics.stage_ms == {}
+
+
+def reason(result: object) -> Reason:
+    assert isinstance(result, Lost)
+    return result.reason
+
+
+def test_a_black_frame_is_too_dark(model: FeatureModel, reader: MapReader) -> None:
+    black = Frame(np.zeros((480, 640), np.uint8), CAMERA)
+    assert reason(Localizer(model, reader).localize(black)) is Reason.TOO_DARK
+
+
+def test_a_frame_with_three_features_has_too_few(model: FeatureModel, reader: MapReader) -> None:
+    image = np.full((480, 640), 100, np.uint8)
+    for x in (160, 320, 480):
+        image[200:280, x - 30 : x + 30] = 200
+    few = Frame(image, CAMERA)
+    result = Localizer(model, reader, LocalizerOptions(max_keypoints=3)).localize(few)
+    assert reason(result) is Reason.FEW_FEATURES
+    assert result.statistics.num_features == 3
+
+
+def test_noise_is_not_a_place(model: FeatureModel, reader: MapReader) -> None:
+    noise = generator("noise").integers(0, 255, (480, 640)).astype(np.uint8)
+    result = Localizer(model, reader).localize(Frame(noise, CAMERA))
+    assert reason(result) in (Reason.FEW_MATCHES, Reason.FEW_INLIERS, Reason.FEW_ANCHORS)
+
+
+def test_an_empty_map_is_no_map(
+    model: FeatureModel, flight: list[tuple[Frame, Rigid3]], tmp_path: Path
+) -> None:
+    with MapWriter.create(tmp_path / "empty.tpmap", model.identity):
+        pass
+    with MapReader.open(tmp_path / "empty.tpmap", model.identity) as empty:
+        assert reason(Localizer(model, empty).localize(flight[0][0])) is Reason.NO_MAP
+
+
+def test_one_anchor_is_too_few(
+    model: FeatureModel, flight: list[tuple[Frame, Rigid3]], tmp_path: Path
+) -> None:
+    frame, truth = flight[0]
+    with MapWriter.create(tmp_path / "one.tpmap", model.identity) as writer:
+        writer.add("one", CAMERA, truth, model.extract(frame.image))
+    with MapReader.open(tmp_path / "one.tpmap", model.identity) as one:
+        assert reason(Localizer(model, one).localize(frame)) is Reason.FEW_ANCHORS
+
+
+def test_an_uncertain_position_is_refused_where_a_limit_is_set(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    options = LocalizerOptions(max_position_std_m=1e-6)
+    result = Localizer(model, reader, options).localize(flight[0][0])
+    assert reason(result) is Reason.HIGH_UNCERTAINTY
+
+
+def test_anchors_on_one_line_with_the_query_are_degenerate() -> None:
+    """Every ray to the query runs along the line: nothing tells how far it is."""
+    ahead = Rigid3.from_center(np.tile(np.eye(3), (4, 1, 1)), np.outer([0, 1, 2, 5], [0, 0, 1.0]))
+    query = Rigid3.from_center(np.eye(3), np.array([0, 0, 3.0]))
+    relative = query @ ahead.inverse()
+    unit = Rigid3(relative.R, relative.t / np.linalg.norm(relative.t, axis=1, keepdims=True))
+    assert average_poses(ahead, unit, LocalizerOptions()) is Reason.DEGENERATE_ANCHORS
+    assert average_poses(ahead[:1], unit[:1], LocalizerOptions()) is Reason.FEW_ANCHORS
+
+
+def test_a_frame_of_another_size_than_its_camera_is_an_error(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    frame = replace(flight[0][0], image=np.zeros((240, 320), np.uint8))
+    with pytest.raises(ConfigError, match="has 320 x 240 px, its camera 640 x 480"):
+        Localizer(model, reader).localize(frame)
+
+
+@pytest.mark.parametrize("changes", [{"num_anchors": 1}, {"min_inliers": 0}, {"max_keypoints": -5}])
+def test_settings_out_of_range_are_errors(changes: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(changes))):
+        LocalizerOptions(**changes)  # type: ignore[arg-type]
