@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 DEMO := build/demo
-DATA := ../shared/data
+KITCHEN := ../shared/data/7scenes_redkitchen
 
 .PHONY: demo test check golden bench wheel-test clean
 
@@ -38,8 +38,19 @@ check: $(READY)
 golden: $(READY)
 	$(BIN)/python -m pytest tests/replay --golden
 
+# Stage times on the real kitchen where the data are, else on the demo's room.
 bench: $(READY)
-	$(BIN)/python benchmarks/stage_times.py $(DATA)
+	@mkdir -p build/bench && rm -f build/bench/map.tpmap
+	@if test -d $(KITCHEN); then \
+	  $(BIN)/trigpoint-db build build/bench/map.tpmap --colmap $(KITCHEN) --images $(KITCHEN)/images \
+	    --list $(KITCHEN)/map.txt >/dev/null && \
+	  $(BIN)/python benchmarks/stage_times.py build/bench/map.tpmap \
+	    --images $(KITCHEN)/images --queries $(KITCHEN)/queries.txt; \
+	else \
+	  test -f $(DEMO)/map.tpmap || $(BIN)/trigpoint-db demo $(DEMO); \
+	  $(BIN)/python benchmarks/stage_times.py $(DEMO)/map.tpmap \
+	    --images $(DEMO)/flight --queries $(DEMO)/queries.txt; \
+	fi
 
 # The suite against the installed wheel, not the checkout.
 wheel-test: $(READY)

@@ -117,5 +117,7 @@ def make_demo(
         for time_ns, image in zip(times_ns, flight, strict=True)
     ]
     (folder / "truth.txt").write_text("".join(lines))
+    queries = [f"{image.name} {image.camera.to_text()}\n" for image in flight]
+    (folder / "queries.txt").write_text("".join(queries))
     (folder / "trigpointd.toml").write_text(_CONFIG)
     return survey

@@ -189,6 +189,35 @@ def test_verify_finds_what_does_not_fit_together(
         assert problem in reader.verify()
 
 
+def test_an_image_under_the_key_of_another_is_damage(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 3)
+    with (
+        lmdb.open(str(path), subdir=False, lib_version=0) as environment,
+        environment.begin(write=True) as txn,
+    ):
+        txn.put(schema.features_key(2), txn.get(schema.features_key(1), b""))
+    with MapReader.open(path) as reader, pytest.raises(DatabaseError, match="image 2 is damaged"):
+        reader.anchor(2)
+
+
+def test_a_writer_refuses_a_map_whose_list_of_free_pages_is_damaged(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 3)
+    octets = bytearray(path.read_bytes())
+    roots = max(  # commit; roots of the free list and of the map
+        struct.unpack_from("<144x Q", octets, meta)
+        + struct.unpack_from("<80x Q 40x Q", octets, meta)
+        for meta in (0, PAGE_BYTES)
+    )
+    _, free_list, tree = roots
+    end = (free_list + 1) * PAGE_BYTES
+    struct.pack_into("<Q", octets, end - 8, tree)  # the map's root is said to be free
+    path.write_bytes(octets)
+    with MapReader.open(path) as reader:
+        assert reader.verify() == []
+    with pytest.raises(DatabaseError, match=r"both reachable and in the freeDB.*restore"):
+        MapWriter.open(path, MODEL)
+
+
 @pytest.mark.parametrize(
     ("num_images", "name_bytes"),
     [(20, 30), (150, 480)],  # a tree of one page; one of three levels

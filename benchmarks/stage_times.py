@@ -1,0 +1,89 @@
+"""Where the time of one query goes, at K = 20 and K = 50 anchors.
+
+    python benchmarks/stage_times.py MAP --images DIR --queries FILE
+
+Prints a Markdown table: median and 99th percentile of each stage over all queries, after a warm-up,
+for both K frame by frame in turn, so that a machine that slows down slows both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import time
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import threadpoolctl
+
+from trigpoint.database.reader import MapReader
+from trigpoint.frame import Localized
+from trigpoint.localizer import Localizer
+from trigpoint.models.features import FeatureModel
+from trigpoint.stages import LocalizerOptions
+from trigpoint_db.build import read_frame
+from trigpoint_db.poses import read_queries
+
+ANCHORS = (20, 50)
+ROUNDS = 3
+
+
+def describe_machine() -> str:
+    """Name the processor and the libraries that count."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return (
+        f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores; Python "
+        f"{platform.python_version()}, numpy {np.__version__}, onnxruntime "
+        f"{onnxruntime.__version__}; one BLAS thread, two network threads"
+    )
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("map", type=Path)
+    parser.add_argument("--images", type=Path, required=True)
+    parser.add_argument("--queries", type=Path, required=True)
+    arguments = parser.parse_args()
+    threadpoolctl.threadpool_limits(1, user_api="blas")
+    network = FeatureModel.load()
+    frames = [
+        read_frame(arguments.images / query.name, query.camera, query.name)
+        for query in read_queries(arguments.queries)
+    ]
+    times: dict[int, dict[str, list[float]]] = {k: {} for k in ANCHORS}
+    localized = dict.fromkeys(ANCHORS, 0)
+    with MapReader.open(arguments.map, network.identity) as reader:
+        localizers = {
+            k: Localizer(network, reader, LocalizerOptions(num_anchors=k), time.perf_counter)
+            for k in ANCHORS
+        }
+        for localizer in localizers.values():
+            localizer.localize(frames[0])
+        for frame in frames * ROUNDS:
+            for k, localizer in localizers.items():
+                start = time.perf_counter()
+                result = localizer.localize(frame)
+                total = (time.perf_counter() - start) * 1e3
+                localized[k] += isinstance(result, Localized)
+                for stage, ms in {**result.statistics.stage_ms, "total": total}.items():
+                    times[k].setdefault(stage, []).append(ms)
+        num_images = len(reader)
+    print(f"{describe_machine()}\n")
+    print(f"{len(frames)} queries, {ROUNDS} times, {frames[0].camera.width} x", end=" ")
+    print(f"{frames[0].camera.height} px, 1024 keypoints, a map of {num_images} images;", end=" ")
+    print(", ".join(f"K={k}: {n} of {len(frames) * ROUNDS} OK" for k, n in localized.items()))
+    print("\n| stage (ms) | " + " | ".join(f"K={k} median | K={k} p99" for k in ANCHORS) + " |")
+    print("|---|" + "---:|" * 2 * len(ANCHORS))
+    for stage in times[max(ANCHORS)]:
+        cells = [
+            f"{np.percentile(times[k].get(stage, [0.0]), p):.1f}" for k in ANCHORS for p in (50, 99)
+        ]
+        print(f"| {stage} | " + " | ".join(cells) + " |")
+
+
+if __name__ == "__main__":
+    main()
