@@ -1,0 +1,41 @@
+"""What the docs say of settings and of messages is what the code does."""
+
+import dataclasses
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from trigpoint.frame import Reason, Statistics
+from trigpoint.stages import LocalizerOptions
+from trigpointd.config import Config
+
+DOCS = Path(__file__).parents[2] / "docs"
+pytestmark = pytest.mark.skipif(not DOCS.is_dir(), reason="needs the checkout's docs/")
+
+
+def test_every_setting_of_the_localizer_is_listed_with_its_default() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| (\S+) \|", (DOCS / "configuration.md").read_text(), re.M)
+    defaults = {
+        field.name: "off" if field.default is None else str(field.default)
+        for field in dataclasses.fields(LocalizerOptions)
+    }
+    assert {name: value.strip('"') for name, value in rows} == defaults
+
+
+def test_the_example_has_every_other_setting_and_is_valid() -> None:
+    text = (DOCS / "configuration.md").read_text()
+    tables = tomllib.loads(text.split("```toml")[1].split("```")[0])
+    config = Config.model_validate(tables)
+    assert set(tables) == set(Config.model_fields) - {"localizer"}
+    for name in ("source", "camera", "model", "zenoh", "log"):
+        assert set(tables[name]) == set(type(getattr(config, name)).model_fields)
+
+
+def test_every_reason_and_count_is_explained() -> None:
+    text = (DOCS / "interfaces.md").read_text()
+    for reason in Reason:
+        assert f"`{reason}`" in text
+    for field in dataclasses.fields(Statistics):
+        assert f"`{field.name}`" in text
