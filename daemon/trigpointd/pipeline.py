@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from dataclasses import dataclass
 from typing import Any
 
+from trigpoint.database.reader import MapReader
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import Frame, Localized, Result, describe
 from trigpoint.localizer import Localizer
@@ -14,6 +16,8 @@ from trigpoint.rigid import Rigid3
 from trigpointd.messages.cdr import encode_pose
 from trigpointd.messages.pose import body_pose
 from trigpointd.sources.base import BadFrame, Captured
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -55,8 +59,12 @@ class Output:
 class Pipeline:
     """Localizes captured frames and writes the messages about them."""
 
-    def __init__(self, localizer: Localizer, body_from_camera: Rigid3, map_frame: str) -> None:
+    def __init__(
+        self, localizer: Localizer, reader: MapReader, body_from_camera: Rigid3, map_frame: str
+    ) -> None:
         self._localizer = localizer
+        self._reader = reader
+        self._map_problem = ""
         self._body_from_camera = body_from_camera
         self._map_frame = map_frame
 
@@ -64,6 +72,7 @@ class Pipeline:
         """Localize one frame; `num_dropped` is how many the slot has dropped so far."""
         start_s = time.perf_counter()
         frame = captured.frame
+        self._refresh_map()
         result = self._localize(frame)
         pose = None
         if isinstance(result, Localized):
@@ -77,8 +86,21 @@ class Pipeline:
             **(result.describe() if isinstance(result, Failure) else describe(result)),
             "latency_ms": round((time.perf_counter() - start_s) * 1e3, 3),
             "num_dropped": num_dropped,
+            "map_generation": self._reader.generation,
         }
         return Output(captured, result, pose, json.dumps(status).encode())
+
+    def _refresh_map(self) -> None:
+        """Take up what was added to the map; where that cannot be used, keep what there was."""
+        problem = ""
+        try:
+            if self._reader.refresh():
+                _log.info("the map is now of generation %d", self._reader.generation)
+        except DatabaseError as error:
+            problem = str(error)
+        if problem and problem != self._map_problem:
+            _log.error("%s; going on with the map as it was", problem)
+        self._map_problem = problem
 
     def _localize(self, frame: Frame | BadFrame) -> Result | Failure:
         if isinstance(frame, BadFrame):

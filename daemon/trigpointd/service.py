@@ -74,7 +74,7 @@ def open_pipeline(config: Config) -> Iterator[Pipeline]:
     model = FeatureModel.load(config.model.path, num_threads=config.model.num_threads)
     with MapReader.open(config.map, model.identity) as reader:
         localizer = Localizer(model, reader, config.localizer, clock=time.perf_counter)
-        yield Pipeline(localizer, config.camera.body_from_camera, config.map_frame)
+        yield Pipeline(localizer, reader, config.camera.body_from_camera, config.map_frame)
 
 
 def open_source(config: Config) -> Source:

@@ -13,6 +13,8 @@ from trigpoint.images import read_gray
 from trigpoint.models.features import FeatureModel
 from trigpoint_db.importers.colmap import PosedImage
 
+COMMIT_EVERY = 100  # images; until then they are in memory
+
 
 def select_images(images: Sequence[PosedImage], names: Sequence[str]) -> list[PosedImage]:
     """Keep the images named; a name that the model does not know is an error."""
@@ -61,7 +63,11 @@ def build_map(
     partial.unlink(missing_ok=True)
     try:
         with MapWriter.create(partial, model.identity) as writer:
-            count = _add(writer, images, folder, model, max_keypoints)
+            for image in images:
+                _add(writer, image, folder, model, max_keypoints)
+                if len(writer) % COMMIT_EVERY == 0:
+                    writer.commit()
+            count = len(writer)
         partial.rename(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -77,22 +83,17 @@ def append_map(
     *,
     max_keypoints: int = 1024,
 ) -> int:
-    """Add images to a map, all or none of them."""
+    """Add images to a map, all or none of them. Returns how many."""
     with MapWriter.open(path, model.identity) as writer:
-        return _add(writer, images, folder, model, max_keypoints)
+        before = len(writer)
+        for image in images:
+            _add(writer, image, folder, model, max_keypoints)
+        return len(writer) - before
 
 
 def _add(
-    writer: MapWriter,
-    images: Iterable[PosedImage],
-    folder: Path,
-    model: FeatureModel,
-    max_keypoints: int,
-) -> int:
-    count = 0
-    for image in images:
-        frame = read_frame(folder / image.name, image.camera, image.name)
-        features = model.extract(frame.image, max_keypoints)
-        writer.add(image.name, image.camera, image.cam_from_world, features)
-        count += 1
-    return count
+    writer: MapWriter, image: PosedImage, folder: Path, model: FeatureModel, max_keypoints: int
+) -> None:
+    frame = read_frame(folder / image.name, image.camera, image.name)
+    features = model.extract(frame.image, max_keypoints)
+    writer.add(image.name, image.camera, image.cam_from_world, features)

@@ -4,7 +4,7 @@ import pytest
 from tests.unit.scenes import generator, make_scene
 from tests.unit.test_relative_pose import BACKENDS
 from trigpoint.geometry.absolute_pose import estimate_absolute_pose
-from trigpoint.geometry.relative_pose import Backend
+from trigpoint.geometry.backend import Backend
 from trigpoint.rigid import rotation_angle
 
 

@@ -124,12 +124,12 @@ def changed(**arrays: NDArray[np.float32]) -> LocalFeatures:
     ("changes", "message"),
     [
         ({"name": "folder/0.png"}, "holds an image 'folder/0.png' already"),
-        ({"name": ""}, "a name of 0 bytes"),
-        ({"name": "ä" * 251}, "a name of 502 bytes"),
+        ({"name": ""}, "has 0 bytes"),
+        ({"name": "ä" * 251}, "has 502 bytes"),
         ({"name": "\udcff"}, "not valid Unicode"),
         ({"cam_from_world": Rigid3(np.eye(3), np.array([0, np.nan, 0]))}, "not finite"),
-        ({"cam_from_world": Rigid3(-np.eye(3), np.zeros(3))}, "R is no rotation"),
-        ({"cam_from_world": Rigid3.stack([make_pose(0)])}, "one pose an image"),
+        ({"cam_from_world": Rigid3(-np.eye(3), np.zeros(3))}, "is no rotation"),
+        ({"cam_from_world": Rigid3.stack([make_pose(0)])}, "is a batch"),
         ({"features": make_features(9, model=replace(MODEL, descriptor_dim=8))}, "descriptors"),
         ({"features": make_features(9, model=replace(MODEL, global_dim=8))}, "global_descriptor"),
         ({"features": changed(keypoints=np.zeros((39, 2), np.float32))}, r"\(39, 16\)"),
@@ -246,5 +246,5 @@ def test_what_is_closed_says_so(tmp_path: Path) -> None:
         closable.close()
     with pytest.raises(DatabaseError, match="this writer is closed"):
         add(writer, 0)
-    with pytest.raises(DatabaseError, match="this reader is closed"):
+    with pytest.raises(DatabaseError, match=r"^[^:]*: this reader is closed"):
         reader.names()

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from tests.unit.scenes import generator, make_scene, numeric_jacobian
+from trigpoint.geometry.backend import Backend
 from trigpoint.geometry.epipolar import essential_matrix, sampson_error
 from trigpoint.geometry.relative_pose import (
-    Backend,
     estimate_relative_pose,
     refine_relative_pose,
     sampson_jacobian,

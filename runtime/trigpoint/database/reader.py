@@ -23,7 +23,8 @@ Array32 = NDArray[np.float32]
 class MapReader:
     """A map, read on one snapshot.
 
-    A writer at work cannot reuse pages that the snapshot sees: `refresh` now and then.
+    A writer at work cannot reuse pages that the snapshot sees: `refresh` now and then. One thread
+    at a time may use a reader.
     """
 
     def __init__(self, path: Path, snapshot: Snapshot) -> None:
@@ -44,11 +45,12 @@ class MapReader:
 
     @contextmanager
     def _reading(self) -> Iterator[Snapshot]:
+        snapshot = self._current
         with reporting(self._path):
             try:
-                yield self._current
+                yield snapshot
             finally:
-                self._current.require_kept()
+                snapshot.require_kept()
 
     @property
     def model(self) -> ModelIdentity:

@@ -43,7 +43,8 @@ MAX_KEYPOINTS = 65_535
 METADATA_KEY = b"\x00"
 _CRC = struct.Struct("<I")
 _INDEX = struct.Struct("<I")
-_IMAGE = struct.Struct("<7d 8d 24s IIIH")  # pose, parameters, model; sizes, keypoints: all, here
+# Quaternion and t, parameters, model; width, height, keypoints; how many of these lie here.
+_IMAGE = struct.Struct("<7d 8d 24s III H")
 _MAX_INLINE_BYTES = 1024
 
 
@@ -143,9 +144,9 @@ def encode_image(
 ) -> tuple[bytes, bytes]:
     """Write an image and its features.
 
-    LMDB gives a large value whole pages. Where the features hang over their last page but a little
-    (1024 x 64 are 17 pages and 36 bytes), the first keypoints move to the image, which lies in the
-    tree's own pages.
+    LMDB gives a large value whole pages. Where the features would hang over their last page but a
+    little (1024 x 64 are 17 pages and 20 bytes), the first keypoints go to the image instead, which
+    lies in the tree's own pages.
     """
     num_keypoints, dim = features.descriptors.shape
     step = _keypoint_step_px(camera)
@@ -220,10 +221,10 @@ def _descriptor_step(dim: int) -> float:
 
 def quantize_row(row: Array32) -> tuple[np.float32, NDArray[np.int8]]:
     """Return the scale and the int8 numbers (G,) of a global descriptor; zero stays zero."""
-    peak = np.abs(row).max()
-    numbers = np.rint(row * np.float32(127 / peak if peak > 0 else 0)).astype(np.int8)
-    norm = np.linalg.norm(numbers.astype(np.float32))
-    return np.float32(1 / norm if norm > 0 else 0), numbers
+    peak = max(float(np.abs(row).max()), 1e-30)
+    numbers = np.rint(row / np.float32(peak) * 127).astype(np.int8)
+    norm = float(np.linalg.norm(numbers.astype(np.float32)))
+    return np.float32(1 / max(norm, 1.0)), numbers
 
 
 def encode_block(scales: Array32, rows: NDArray[np.int8]) -> bytes:

@@ -57,11 +57,11 @@ class MapWriter:
             undo.callback(path.unlink)
             undo.callback(os.close, fd)
             _lock(fd)
-            writer = cls(path, fd, schema.Metadata(model))
-            with writer._writing() as txn:
-                writer._put(txn, schema.METADATA_KEY, writer._metadata.encode())
-                txn.commit()
-                writer._txn = None
+            metadata = schema.Metadata(model)
+            environment = share_environment(path, fd)
+            with environment.begin(write=True) as txn:
+                _put(txn, schema.METADATA_KEY, metadata.encode())
+            writer = cls(path, fd, metadata)
             undo.pop_all()
             return writer
 
@@ -88,15 +88,15 @@ class MapWriter:
         """Add an image and return its index; one that cannot be added leaves no trace."""
         with self._writing() as txn:
             _require_name(name)
-            _require_pose(cam_from_world)
-            _require_features(features, camera, self._metadata.model)
+            _require_pose(name, cam_from_world)
+            _require_features(name, features, camera, self._metadata.model)
             if txn.get(schema.name_key(name)) is not None:
                 raise DatabaseError(f"holds an image {name!r} already")
             index = self._num_images
             image, arrays = schema.encode_image(name, camera, cam_from_world, features)
-            self._put(txn, schema.name_key(name), schema.encode_index(index))
-            self._put(txn, schema.image_key(index), image)
-            self._put(txn, schema.features_key(index), arrays)
+            _put(txn, schema.name_key(name), schema.encode_index(index))
+            _put(txn, schema.image_key(index), image)
+            _put(txn, schema.features_key(index), arrays)
             scale, row = schema.quantize_row(features.global_descriptor)
             self._scales.append(scale)
             self._rows.append(row)
@@ -118,7 +118,7 @@ class MapWriter:
                 generation=self._metadata.generation + 1,
                 num_images=self._num_images,
             )
-            self._put(txn, schema.METADATA_KEY, metadata.encode())
+            _put(txn, schema.METADATA_KEY, metadata.encode())
             txn.commit()
             self._txn, self._metadata = None, metadata
 
@@ -157,12 +157,9 @@ class MapWriter:
                     "so free disk space if that is it, and add the rest again"
                 ) from error
 
-    def _put(self, txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
-        txn.put(key, schema.seal(key, payload))
-
     def _put_last_block(self, txn: lmdb.Transaction) -> None:
         block = schema.encode_block(np.array(self._scales), np.array(self._rows))
-        self._put(txn, schema.block_key((self._num_images - 1) // schema.BLOCK_ROWS), block)
+        _put(txn, schema.block_key((self._num_images - 1) // schema.BLOCK_ROWS), block)
 
     def _load_last_block(self, snapshot: Snapshot) -> None:
         block, num_rows = divmod(self._num_images, schema.BLOCK_ROWS)
@@ -170,6 +167,10 @@ class MapWriter:
             payload = snapshot.get(schema.block_key(block))
             scales, rows = schema.decode_block(payload, self._metadata.model.global_dim)
             self._scales, self._rows = list(scales), list(rows.copy())
+
+
+def _put(txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
+    txn.put(key, schema.seal(key, payload))
 
 
 def _lock(fd: int) -> None:
@@ -193,46 +194,46 @@ def _require_name(name: str) -> None:
     try:
         size = len(name.encode())
     except UnicodeEncodeError as error:
-        raise DatabaseError(f"cannot hold the name {name!r}: it is not valid Unicode") from error
+        raise DatabaseError(f"the name {name!r} is not valid Unicode") from error
     if not 1 <= size <= schema.MAX_NAME_BYTES:
         raise DatabaseError(
-            f"cannot hold a name of {size} bytes ({name[:40]!r}...); "
-            f"1 to {schema.MAX_NAME_BYTES} are possible"
+            f"the name {name[:40]!r}... has {size} bytes; 1 to {schema.MAX_NAME_BYTES} are possible"
         )
 
 
-def _require_pose(cam_from_world: Rigid3) -> None:
+def _require_pose(name: str, cam_from_world: Rigid3) -> None:
     R, t = cam_from_world.R, cam_from_world.t
     if R.shape != (3, 3) or t.shape != (3,):
-        raise DatabaseError(f"holds one pose an image, not {R.shape} and {t.shape}")
+        raise DatabaseError(f"the pose of {name!r} is a batch, {R.shape} and {t.shape}")
     if not (np.isfinite(R).all() and np.isfinite(t).all()):
-        raise DatabaseError("cannot hold a pose that is not finite")
+        raise DatabaseError(f"the pose of {name!r} is not finite")
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-5 or np.linalg.det(R) < 0:
-        raise DatabaseError(f"cannot hold a pose whose R is no rotation: {R.tolist()}")
+        raise DatabaseError(f"the R of {name!r} is no rotation")
 
 
-def _require_features(features: LocalFeatures, camera: Camera, model: ModelIdentity) -> None:
+def _require_features(
+    name: str, features: LocalFeatures, camera: Camera, model: ModelIdentity
+) -> None:
     num_keypoints = len(features)
     if num_keypoints > schema.MAX_KEYPOINTS:
         raise DatabaseError(
-            f"cannot hold {num_keypoints} keypoints of an image; "
-            f"{schema.MAX_KEYPOINTS} are possible"
+            f"{name!r} has {num_keypoints} keypoints; {schema.MAX_KEYPOINTS} are possible"
         )
-    wanted = {
+    shapes = {
         "keypoints": (num_keypoints, 2),
         "descriptors": (num_keypoints, model.descriptor_dim),
         "global_descriptor": (model.global_dim,),
     }
-    for field, shape in wanted.items():
+    for field, shape in shapes.items():
         array = getattr(features, field)
         if array.shape != shape:
             raise DatabaseError(
-                f"its model {model.name!r} gives {field} {shape}, these are {array.shape}"
+                f"{name!r} has {field} {array.shape}; those of model {model.name!r} are {shape}"
             )
         if not np.isfinite(array).all():
-            raise DatabaseError(f"cannot hold {field} that are not finite")
+            raise DatabaseError(f"{name!r} has {field} that are not finite")
     limit = (camera.width - 0.5, camera.height - 0.5)
     if ((features.keypoints < -0.5) | (features.keypoints > limit)).any():
         raise DatabaseError(
-            f"keypoints lie outside their image of {camera.width} x {camera.height} px"
+            f"{name!r} has keypoints outside its {camera.width} x {camera.height} px"
         )

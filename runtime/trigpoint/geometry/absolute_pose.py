@@ -1,6 +1,6 @@
 """Robust pose of a camera from points known in the world: P3P in LO-RANSAC.
 
-PoseLib where it is installed, else OpenCV's solver; both are seeded.
+PoseLib's, or OpenCV's; both are seeded.
 """
 
 from __future__ import annotations
@@ -9,13 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trigpoint.geometry.relative_pose import Backend
+from trigpoint.geometry.backend import NORMALIZED_CAMERA, Backend, poselib
 from trigpoint.rigid import Rigid3
-
-try:
-    import poselib
-except ImportError:  # no wheel for this machine
-    poselib = None
 
 Array = NDArray[np.float64]
 
@@ -51,7 +46,6 @@ def estimate_absolute_pose(
 
 
 def _poselib(points3d: Array, points2d: Array, max_error: float) -> Rigid3 | None:
-    camera = {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [1.0, 0.0, 0.0]}
     options = {
         "max_reproj_error": max_error,
         "min_iterations": 50,
@@ -59,7 +53,7 @@ def _poselib(points3d: Array, points2d: Array, max_error: float) -> Rigid3 | Non
         "progressive_sampling": True,
         "seed": 0,
     }
-    pose, info = poselib.estimate_absolute_pose(points2d, points3d, camera, options, {})
+    pose, info = poselib.estimate_absolute_pose(points2d, points3d, NORMALIZED_CAMERA, options, {})
     if info["num_inliers"] < MIN_POINTS:
         return None
     return Rigid3(np.array(pose.R), np.array(pose.t))

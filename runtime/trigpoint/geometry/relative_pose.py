@@ -1,42 +1,24 @@
 """Robust relative pose of two calibrated views: five points in RANSAC, then refinement.
 
-Two back ends: PoseLib's LO-RANSAC where it is installed, else OpenCV's USAC followed by our own
-minimisation of the Sampson error. PoseLib is the better and faster one, but has no wheels for
-aarch64.
+Two back ends: PoseLib's LO-RANSAC, and OpenCV's USAC followed by our own minimisation of the
+Sampson error.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from trigpoint.geometry.backend import NORMALIZED_CAMERA, Backend, poselib
 from trigpoint.geometry.epipolar import essential_matrix, homogeneous, sampson_error
 from trigpoint.rigid import Rigid3, rotation_from_vector, skew
-
-try:
-    import poselib
-except ImportError:  # no wheel for this machine
-    poselib = None
 
 Array = NDArray[np.float64]
 
 MIN_MATCHES = 6  # five determine the pose, one more tells whether it is right
-
-
-class Backend(Enum):
-    """Which RANSAC to run."""
-
-    POSELIB = "poselib"
-    OPENCV = "opencv"
-
-    @classmethod
-    def best(cls) -> Backend:
-        """Return the best one installed."""
-        return cls.OPENCV if poselib is None else cls.POSELIB
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +61,6 @@ def estimate_relative_pose(
 
 
 def _poselib(points_a: Array, points_b: Array, max_error: float) -> Rigid3 | None:
-    camera = {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [1.0, 0.0, 0.0]}
     options = {
         "max_epipolar_error": max_error,
         "min_iterations": 30,
@@ -87,7 +68,9 @@ def _poselib(points_a: Array, points_b: Array, max_error: float) -> Rigid3 | Non
         "progressive_sampling": True,
         "seed": 0,
     }
-    pose, info = poselib.estimate_relative_pose(points_a, points_b, camera, camera, options, {})
+    pose, info = poselib.estimate_relative_pose(
+        points_a, points_b, NORMALIZED_CAMERA, NORMALIZED_CAMERA, options, {}
+    )
     length = np.linalg.norm(pose.t)
     if info["num_inliers"] < MIN_MATCHES or not length > 0:
         return None

@@ -1,0 +1,101 @@
+"""What is said of frames while the map under the daemon changes or is damaged."""
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.conftest import Demo
+from trigpoint.database.reader import MapReader
+from trigpoint.database.writer import MapWriter
+from trigpoint.frame import Frame, ModelIdentity
+from trigpoint.images import read_gray
+from trigpoint.localizer import Localizer
+from trigpoint.models.features import FeatureModel
+from trigpoint.rigid import Rigid3
+from trigpoint_db.build import append_map, build_map
+from trigpoint_db.demo import CAMERA
+from trigpoint_db.importers.colmap import PosedImage, read_model
+from trigpointd.pipeline import Pipeline
+from trigpointd.sources.base import Captured
+
+
+@pytest.fixture
+def survey(demo: Demo) -> list[PosedImage]:
+    return read_model(demo.folder / "sparse")[:24]
+
+
+@pytest.fixture
+def map_path(demo: Demo, tmp_path: Path, model: FeatureModel, survey: list[PosedImage]) -> Path:
+    build_map(tmp_path / "m.tpmap", survey[:1], demo.folder / "survey", model)
+    return tmp_path / "m.tpmap"
+
+
+@pytest.fixture
+def pipeline(map_path: Path, model: FeatureModel) -> Iterator[Pipeline]:
+    with MapReader.open(map_path, model.identity) as reader:
+        localizer = Localizer(model, reader, clock=time.perf_counter)
+        yield Pipeline(localizer, reader, Rigid3.identity(), "map")
+
+
+@pytest.fixture
+def captured(demo: Demo, survey: list[PosedImage]) -> Captured:
+    """The second image of the survey: it sees what the first sees from elsewhere."""
+    image = read_gray(demo.folder / "survey" / survey[1].name)
+    return Captured(Frame(image, CAMERA, time_ns=5), log_time_ns=5)
+
+
+def status(pipeline: Pipeline, captured: Captured) -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads(pipeline.process(captured, 0).status)
+    return loaded
+
+
+def test_images_added_under_the_daemon_are_used_from_the_next_frame_on(
+    pipeline: Pipeline,
+    captured: Captured,
+    demo: Demo,
+    map_path: Path,
+    model: FeatureModel,
+    survey: list[PosedImage],
+) -> None:
+    before = status(pipeline, captured)
+    assert before["reason"] == "FEW_ANCHORS"
+    append_map(map_path, survey[1:], demo.folder / "survey", model)
+    after = status(pipeline, captured)
+    assert after["status"] == "LOCALIZED"
+    assert after["map_generation"] == before["map_generation"] + 1
+
+
+def test_a_map_of_another_model_put_in_place_is_not_taken_up(
+    pipeline: Pipeline, captured: Captured, map_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    status(pipeline, captured)
+    other = map_path.with_name("other.tpmap")
+    with MapWriter.create(other, ModelIdentity("other", "00", 64, 512)):
+        pass
+    other.rename(map_path)
+    for _ in range(3):
+        assert status(pipeline, captured)["reason"] == "FEW_ANCHORS"
+    said = [record for record in caplog.records if "going on with the map" in record.message]
+    assert len(said) == 1
+
+
+def test_a_damaged_image_of_the_map_costs_the_frames_that_need_it_alone(
+    demo: Demo, map_path: Path, model: FeatureModel, captured: Captured
+) -> None:
+    data = bytearray(map_path.read_bytes())
+    middle = len(data) - 20_000  # within the descriptors of the only image
+    data[middle : middle + 64] = bytes(64)
+    damaged = map_path.with_name("damaged.tpmap")
+    damaged.write_bytes(data)
+    with MapReader.open(damaged, model.identity) as reader:
+        pipeline = Pipeline(Localizer(model, reader), reader, Rigid3.identity(), "map")
+        failed = status(pipeline, captured)
+        assert (failed["status"], failed["reason"]) == ("FAILED", "BAD_MAP")
+        assert "damaged" in failed["detail"]
+        black = Frame(np.zeros((480, 640), np.uint8), CAMERA)
+        assert status(pipeline, Captured(black, 6))["reason"] == "TOO_DARK"
