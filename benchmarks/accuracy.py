@@ -3,8 +3,8 @@
     python benchmarks/accuracy.py ../shared/data [--anchors 20]
 
 Each set is a folder with `images/`, `sparse/` (a COLMAP model), and for each split `map*.txt`
-(names) and `queries*.txt` (names with cameras). Failures count as infinite errors. The last column is the
-share of localized queries whose true center lies inside the 95 % ellipsoid of the covariance.
+(names) and `queries*.txt` (names with cameras). Failures count as infinite errors. The last column
+is the share of localized queries whose true center lies inside the covariance's 95 % ellipsoid.
 """
 
 from __future__ import annotations
