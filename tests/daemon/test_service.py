@@ -22,6 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 from tests.conftest import Demo
 from trigpoint.camera import Camera
 from trigpoint.rigid import Rigid3, rotation_angle
+from trigpoint_db.demo import BODY_FROM_CAMERA
 from trigpoint_db.poses import read_poses
 from trigpoint_db.recording import RecordedImage, write_recording
 
@@ -246,3 +247,22 @@ def test_check_config_opens_what_is_named(demo: Demo, tmp_path: Path) -> None:
     done = run("trigpointd", "check-config", config)
     assert done.returncode == 1
     assert "nap.tpmap" in done.stderr
+
+
+def test_without_poselib_opencv_does_its_part(demo: Demo, tmp_path: Path) -> None:
+    """As on aarch64, for which PoseLib has no wheel."""
+    program = "import sys; sys.modules['poselib'] = None; from trigpointd.cli import main; main()"
+    poses = tmp_path / "poses.txt"
+    arguments = ["replay", demo.recording, "--map", demo.map, "--poses", poses]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    truth, found = read_poses(demo.truth), read_poses(poses)
+    assert len(found) >= 15
+    errors_m = [
+        np.linalg.norm(pose.center - (BODY_FROM_CAMERA.inverse() @ truth[time_ns]).center)
+        for time_ns, pose in found.items()
+    ]
+    assert np.median(errors_m) < 0.01

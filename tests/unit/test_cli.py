@@ -1,0 +1,163 @@
+"""`trigpoint-db` as its users meet it: what it prints, and what it says of bad input."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Demo
+from trigpoint_db.cli import main
+from trigpoint_db.demo import CAMERA
+from trigpoint_db.importers.colmap import read_model, write_model
+from trigpoint_db.poses import read_poses
+
+
+class Run:
+    """Runs the command within this process."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch = monkeypatch
+        self._capsys = capsys
+
+    def __call__(self, *arguments: object) -> tuple[int, str, str]:
+        self._monkeypatch.setattr(sys, "argv", ["trigpoint-db", *map(str, arguments)])
+        self._capsys.readouterr()
+        with pytest.raises(SystemExit) as caught:
+            main()
+        code = caught.value.code
+        out, err = self._capsys.readouterr()
+        if isinstance(code, str):  # what sys.exit(message) prints once the interpreter ends
+            return 1, out, code
+        return int(code or 0), out, err
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    return Run(monkeypatch, capsys)
+
+
+@pytest.fixture
+def place(demo: Demo, tmp_path: Path) -> Path:
+    """A survey of a dozen images, with its COLMAP model, to do harm to."""
+    images = read_model(demo.folder / "sparse")[:12]
+    (tmp_path / "images").mkdir()
+    for image in images:
+        shutil.copy(demo.folder / "survey" / image.name, tmp_path / "images")
+    write_model(tmp_path / "sparse", images)
+    lines = [f"{image.name} {CAMERA.to_text()}\n" for image in images]
+    (tmp_path / "queries.txt").write_text("".join(lines[:3]))
+    return tmp_path
+
+
+def build(place: Path, name: str = "m.tpmap", *more: object) -> list[object]:
+    sources = ["--colmap", place / "sparse", "--images", place / "images"]
+    return ["build", place / name, *sources, *more]
+
+
+def test_from_images_to_numbers(run: Run, place: Path) -> None:
+    code, out, _ = run(*build(place, "m.tpmap", "--json"))
+    assert code == 0
+    assert json.loads(out)["num_images_added"] == 12
+    code, out, _ = run(
+        "localize", place / "m.tpmap", "--images", place / "images",
+        "--queries", place / "queries.txt", "--poses", place / "poses.txt",
+        "--results", place / "results.jsonl", "--anchors", 10, "--json",
+    )  # fmt: skip
+    assert code == 0
+    assert json.loads(out) == {"num_queries": 3, "outcomes": {"LOCALIZED": 3}}
+    results = [json.loads(line) for line in (place / "results.jsonl").read_text().splitlines()]
+    assert [result["num_anchors"] for result in results] == [10, 10, 10]
+    code, out, _ = run(
+        "evaluate", "--poses", place / "poses.txt", "--truth", place / "sparse",
+        "--queries", place / "queries.txt", "--json",
+    )  # fmt: skip
+    assert code == 0
+    # The queries are in the map: what is left is the noise of its own keypoints.
+    assert json.loads(out)["median_position_m"] < 0.01
+
+
+def test_info_and_verify_speak_json_too(run: Run, demo: Demo) -> None:
+    code, out, _ = run("info", demo.map, "--json")
+    assert code == 0
+    assert json.loads(out)["num_images"] == 140
+    code, out, _ = run("verify", demo.map, "--json")
+    assert code == 0
+    assert json.loads(out)["problems"] == []
+
+
+def test_verify_finds_what_was_altered(run: Run, demo: Demo, tmp_path: Path) -> None:
+    data = bytearray(demo.map.read_bytes())
+    data[len(data) // 2] ^= 255
+    (tmp_path / "altered.tpmap").write_bytes(data)
+    code, out, _ = run("verify", tmp_path / "altered.tpmap")
+    assert code == 1
+    assert "damaged" in out or "checksum" in out
+
+
+def test_images_are_added_to_a_map_once(run: Run, place: Path) -> None:
+    names = [image.name for image in read_model(place / "sparse")]
+    (place / "first.txt").write_text("\n".join(names[:5]))
+    (place / "rest.txt").write_text("\n".join(names[5:]))
+    assert run(*build(place, "m.tpmap", "--list", place / "first.txt"))[0] == 0
+    assert run(*build(place, "m.tpmap", "--list", place / "rest.txt", "--append"))[0] == 0
+    code, _, err = run(*build(place, "m.tpmap", "--append"))
+    assert code == 1
+    assert "already" in err
+    _, out, _ = run("info", place / "m.tpmap", "--json")
+    assert json.loads(out)["num_images"] == 12
+
+
+def test_an_existing_map_is_not_overwritten(run: Run, place: Path) -> None:
+    assert run(*build(place))[0] == 0
+    before = (place / "m.tpmap").read_bytes()
+    code, _, err = run(*build(place))
+    assert code == 1
+    assert "exists" in err
+    assert (place / "m.tpmap").read_bytes() == before
+
+
+def test_a_corrupt_image_leaves_no_half_made_map(run: Run, place: Path) -> None:
+    image = sorted((place / "images").glob("*.jpg"))[6]
+    image.write_bytes(b"not a picture")
+    code, _, err = run(*build(place))
+    assert code == 1
+    assert str(image) in err
+    assert "\n" not in err
+    assert not list(place.glob("m.tpmap*"))
+
+
+def test_missing_images_are_counted_before_any_work(run: Run, place: Path) -> None:
+    for image in sorted((place / "images").glob("*.jpg"))[3:5]:
+        image.unlink()
+    code, _, err = run(*build(place))
+    assert code == 1
+    assert "2 images are missing" in err
+
+
+def test_a_corrupt_query_does_not_cost_the_others(run: Run, place: Path) -> None:
+    assert run(*build(place))[0] == 0
+    names = [line.split()[0] for line in (place / "queries.txt").read_text().splitlines()]
+    (place / "images" / names[1]).write_bytes(b"\xff\xd8 not a picture")
+    code, _, err = run(
+        "localize", place / "m.tpmap", "--images", place / "images",
+        "--queries", place / "queries.txt", "--poses", place / "poses.txt",
+        "--results", place / "results.jsonl",
+    )  # fmt: skip
+    assert code == 1
+    assert "1 images could not be used" in err
+    assert set(read_poses(place / "poses.txt")) == {names[0], names[2]}
+    results = [json.loads(line) for line in (place / "results.jsonl").read_text().splitlines()]
+    assert results[1]["reason"] == "BAD_IMAGE"
+
+
+def test_a_recording_needs_cameras_for_its_images(run: Run, place: Path) -> None:
+    out = place / "r.mcap"
+    code, _, err = run("record", out, "--images", place / "images")
+    assert code == 1
+    assert "--camera" in err
+    code, _, err = run("record", out, "--images", place / "images", "--camera", "THIN_PRISM 1 1 1")
+    assert code == 1
+    assert "'THIN_PRISM' is not known" in err
+    assert not out.exists()
