@@ -8,12 +8,12 @@ mkdir -p "$work/run"
 if command -v uv >/dev/null 2>&1; then
   uv build --quiet --wheel --out-dir "$work"
   uv venv --quiet --python .venv/bin/python "$work/venv"
-  uv pip install --quiet --python "$work/venv/bin/python" "$work"/*.whl --group dev matplotlib
+  uv pip install --quiet --python "$work/venv/bin/python" "$(echo "$work"/*.whl)[plots]" --group dev
 else
   .venv/bin/python -m pip wheel --quiet --no-deps --wheel-dir "$work" .
   .venv/bin/python -m venv "$work/venv"
   "$work/venv/bin/python" -m pip install --quiet --upgrade 'pip>=25.1'
-  "$work/venv/bin/python" -m pip install --quiet "$work"/*.whl --group dev matplotlib
+  "$work/venv/bin/python" -m pip install --quiet "$(echo "$work"/*.whl)[plots]" --group dev
 fi
 cp -R tests pyproject.toml "$work/run"
 # The data stay where they are, beside the checkout.

@@ -221,6 +221,7 @@ def record(
     ] = None,
     rate: Annotated[float, typer.Option(help="Images a second.", min=0.01)] = 10.0,
     truth: Annotated[Path | None, typer.Option(help="A COLMAP model's folder.")] = None,
+    as_json: Json = False,
 ) -> None:
     """Write images to a recording that `trigpointd` and Foxglove play."""
     if (camera is None) == (queries is None):
@@ -234,7 +235,10 @@ def record(
     poses = {} if truth is None else read_truth(truth)
     recorded = [RecordedImage(images / q.name, q.camera, poses.get(q.name)) for q in wanted]
     count = write_recording(out, track(recorded, "recording", len(recorded)), rate_hz=rate)
-    print(f"{out}: {count} images, {count / rate:.1f} s")
+    if as_json:
+        print(json.dumps({"recording": str(out), "num_images": count, "rate_hz": rate}))
+    else:
+        print(f"{out}: {count} images, {count / rate:.1f} s")
 
 
 def _image_names(folder: Path) -> list[str]:
@@ -253,6 +257,7 @@ def demo(
     survey: Annotated[int, typer.Option(help="Images of the map.", min=10)] = 140,
     flight: Annotated[int, typer.Option(help="Frames of the flight.", min=2)] = 120,
     seed: Annotated[int, typer.Option(help="Another seed, another room.")] = 0,
+    as_json: Json = False,
 ) -> None:
     """Render a room, survey and fly through it: images, map, recording, truth, settings."""
     posed = make_demo(folder, num_survey=survey, num_flight=flight, seed=seed, progress=track)
@@ -260,7 +265,10 @@ def demo(
     map_.unlink(missing_ok=True)
     network = FeatureModel.load()
     build_map(map_, track(posed, "mapping", len(posed)), folder / "survey", network)
-    print(f"{folder}: map of {survey} images, flight of {flight} frames, trigpointd.toml")
+    if as_json:
+        print(json.dumps({"folder": str(folder), "num_survey": survey, "num_flight": flight}))
+    else:
+        print(f"{folder}: map of {survey} images, flight of {flight} frames, trigpointd.toml")
 
 
 def main() -> None:
