@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
+from trigpoint.errors import ConfigError
 from trigpoint.rigid import Rigid3
 
 
@@ -33,6 +34,14 @@ class Frame:
     camera: Camera
     time_ns: int = 0
     name: str = ""
+
+    def __post_init__(self) -> None:
+        height, width = self.image.shape
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise ConfigError(
+                f"the image is {width} x {height} px, but its camera's calibration is for "
+                f"{self.camera.width} x {self.camera.height} px"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +96,7 @@ class Reason(StrEnum):
     NO_MAP = "NO_MAP"  # the map holds no image
     TOO_DARK = "TOO_DARK"  # hardly any light or contrast in the frame
     FEW_FEATURES = "FEW_FEATURES"  # the frame shows too few keypoints
-    FEW_MATCHES = "FEW_MATCHES"  # no anchor shares enough of them: not a place in the map
+    FEW_MATCHES = "FEW_MATCHES"  # no two anchors share enough of them: not a place in the map
     FEW_ANCHORS = "FEW_ANCHORS"  # fewer than two anchors agree on a pose
     DEGENERATE_ANCHORS = "DEGENERATE_ANCHORS"  # the anchors see the frame along one line
     FEW_INLIERS = "FEW_INLIERS"  # too few latent points agree with the refined pose

@@ -9,13 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from trigpoint.errors import ConfigError
-from trigpoint.frame import Anchor, Frame, Localized, Lost, Reason, Result, Statistics
+from trigpoint.database.reader import MapReader
+from trigpoint.frame import Frame, Localized, Lost, Reason, Result, Statistics
 from trigpoint.geometry.triangulation import triangulate_robust
 from trigpoint.models.features import FeatureModel
 from trigpoint.rigid import Rigid3
@@ -33,33 +30,15 @@ from trigpoint.stages import (
 MIN_CONTRAST = 2.0  # standard deviation of the gray levels
 
 
-class Map(Protocol):
-    """What the localizer asks of a map; `trigpoint.database.reader.MapReader` is one."""
-
-    def __len__(self) -> int:
-        """Count the images."""
-        ...
-
-    def search(
-        self, global_descriptor: NDArray[np.float32], k: int
-    ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        """Return the k most similar images, indices and similarities, best first."""
-        ...
-
-    def anchor(self, index: int) -> Anchor:
-        """Return an image."""
-        ...
-
-
 class Localizer:
     """Localizes frames against one snapshot of a map.
 
     Parameters
     ----------
     model : FeatureModel
-        The network the map was made with.
-    map_ : Map
-        Images with features and poses.
+        The network.
+    reader : MapReader
+        The map, made with the same network.
     options : LocalizerOptions, optional
     clock : callable, optional
         Seconds, monotonic; without it the results have no stage times.
@@ -68,20 +47,19 @@ class Localizer:
     def __init__(
         self,
         model: FeatureModel,
-        map_: Map,
+        reader: MapReader,
         options: LocalizerOptions | None = None,
         clock: Callable[[], float] | None = None,
     ) -> None:
         self.model = model
-        self.map = map_
+        self.reader = reader
         self.options = options or LocalizerOptions()
         self.clock = clock
 
     def localize(self, frame: Frame) -> Result:
         """Estimate cam_from_world of a frame, with covariance, or say why not."""
         options, trace = self.options, _Trace(self.clock)
-        _check_size(frame)
-        if len(self.map) == 0:
+        if len(self.reader) == 0:
             return trace.lost(Reason.NO_MAP, "the map holds no image")
         if (contrast := float(frame.image.std())) < MIN_CONTRAST:
             return trace.lost(Reason.TOO_DARK, f"contrast {contrast:.1f} gray levels")
@@ -93,8 +71,8 @@ class Localizer:
             return trace.lost(Reason.FEW_FEATURES, f"{len(features)} keypoints")
 
         with trace.stage("retrieval"):
-            indices, _ = self.map.search(features.global_descriptor, options.num_anchors)
-            anchors = [self.map.anchor(int(index)) for index in indices]
+            indices, _ = self.reader.search(features.global_descriptor, options.num_anchors)
+            anchors = [self.reader.anchor(int(index)) for index in indices]
         trace.note(num_anchors=len(anchors), anchors=tuple(anchor.name for anchor in anchors))
 
         if len(anchors) < 2:
@@ -106,7 +84,7 @@ class Localizer:
 
         with trace.stage("latent_points"):
             latent = triangulate_robust(
-                query.views, query.tracks, max_error=options.max_ray_error_px * query.px
+                query.views, query.tracks, max_error_px=options.max_ray_error_px
             )
         trace.note(num_points=len(latent.point))
         if len(latent.point) < options.min_inliers:
@@ -169,12 +147,3 @@ class _Trace:
 
     def lost(self, reason: Reason, detail: str) -> Lost:
         return Lost(reason, self.statistics, detail)
-
-
-def _check_size(frame: Frame) -> None:
-    height, width = frame.image.shape
-    if (width, height) != (frame.camera.width, frame.camera.height):
-        raise ConfigError(
-            f"frame {frame.name!r} has {width} x {height} px, its camera "
-            f"{frame.camera.width} x {frame.camera.height}: calibrate for this size"
-        )

@@ -13,11 +13,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
 from trigpoint.frame import Anchor, Frame, LocalFeatures, Reason
 from trigpoint.geometry.absolute_pose import estimate_absolute_pose
 from trigpoint.geometry.anchor_ransac import NoConsensus, find_consensus
-from trigpoint.geometry.center_averaging import average_centers_robust, center_directions
+from trigpoint.geometry.center_averaging import (
+    average_centers,
+    average_centers_robust,
+    center_directions,
+)
 from trigpoint.geometry.epipolar import essential_matrix, sampson_error
 from trigpoint.geometry.pose_refinement import RefinedPose, refine_pose, reprojection
 from trigpoint.geometry.relative_pose import estimate_relative_pose
@@ -39,6 +44,7 @@ class LocalizerOptions:
     # "best": latent points first; anchor pairs too where these have few supporters
     generator: Literal["best", "anchor_pairs", "latent_points"] = "best"
     min_support: int = 100  # latent points that make a second hypothesis needless
+    center: Literal["robust", "least_squares"] = "robust"  # the latter is Proposition 1 as it is
     num_relative_poses: int = 8
     min_relative_inliers: int = 15
     max_epipolar_error_px: float = 1.5
@@ -62,6 +68,8 @@ class LocalizerOptions:
         for name, value in vars(self).items():
             if isinstance(value, int | float) and value <= 0:
                 raise ConfigError(f"{name} must be positive, not {value}")
+        if self.min_inlier_ratio > 1:
+            raise ConfigError(f"min_inlier_ratio must be at most 1, not {self.min_inlier_ratio}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +81,11 @@ class Query:
     points : (N, 2) float64
         The query's keypoints.
     px : float
-        The size of a pixel of the network's image.
+        The normalised size of a pixel, of the image as the network saw it.
     views : Rigid3
         The anchors' cam_from_world (K,).
+    views_px : (K,) float64
+        The same of their pixels.
     tracks : Tracks
         All matches: point is the query's keypoint, view the anchor, xy the place in the anchor.
     matches : list of (M, 2) int
@@ -87,6 +97,7 @@ class Query:
     points: Array
     px: float
     views: Rigid3
+    views_px: Array
     tracks: Tracks
     matches: list[Index]
     anchor_points: list[Array]
@@ -109,16 +120,30 @@ def match_anchors(
     point = np.concatenate(matches)
     view = np.repeat(np.arange(len(anchors)), [len(match) for match in matches])
     order = np.argsort(point, kind="stable")
-    tracks = Tracks(point[order], view[order], np.concatenate(anchor_points)[order])
-    zoom = max(1.0, max(frame.camera.width, frame.camera.height) / long_side_px)
+    views_px = np.array([pixel_size(anchor.camera, long_side_px) for anchor in anchors])
+    xy = np.concatenate(anchor_points)[order]
+    tracks = Tracks(point[order], view[order], xy, views_px[view[order]])
     return Query(
         points,
-        zoom / frame.camera.focal_px,
+        pixel_size(frame.camera, long_side_px),
         Rigid3.stack(anchor.cam_from_world for anchor in anchors),
+        views_px,
         tracks,
         matches,
         anchor_points,
     )
+
+
+def pixel_size(camera: Camera, long_side_px: int) -> float:
+    """Return the normalised size of a pixel of an image that was scaled to fit the network."""
+    zoom = max(1.0, max(camera.width, camera.height) / long_side_px)
+    return zoom / camera.focal_px
+
+
+def mean_px(query: Query, views: Index) -> Array:
+    """Return the size of a pixel between the query and views: their quadratic mean."""
+    mean: Array = np.sqrt((query.px**2 + query.views_px[views] ** 2) / 2)
+    return mean
 
 
 def estimate_relative_poses(query: Query, options: LocalizerOptions) -> tuple[Index, Rigid3]:
@@ -137,7 +162,7 @@ def estimate_relative_poses(query: Query, options: LocalizerOptions) -> tuple[In
         pose = estimate_relative_pose(
             query.anchor_points[k],
             query.points[query.matches[k]],
-            max_error=options.max_epipolar_error_px * query.px,
+            max_error=options.max_epipolar_error_px * float(mean_px(query, k)),
         )
         if pose is not None and pose.inliers.sum() >= options.min_relative_inliers:
             chosen.append(k)
@@ -169,7 +194,8 @@ def average_poses(
         anchors_from_world[consensus.inliers],
         query_from_anchors[consensus.inliers],
     )
-    center = average_centers_robust(anchors.center, center_directions(anchors, relative))
+    average = average_centers_robust if options.center == "robust" else average_centers
+    center = average(anchors.center, center_directions(anchors, relative))
     if center is None:
         return Reason.DEGENERATE_ANCHORS
     return Rigid3.from_center(average_rotations(relative.R @ anchors.R), center), len(anchors)
@@ -200,27 +226,28 @@ def count_support(
     return int((near & in_front).sum())
 
 
-def guide_matches(query: Query, cam_from_world: Rigid3, max_error: float) -> Tracks:
-    """Keep the matches within `max_error` of the epipolar geometry of a hypothesis."""
+def guide_matches(query: Query, cam_from_world: Rigid3, max_error_px: float) -> Tracks:
+    """Keep the matches within `max_error_px` of the epipolar geometry of a hypothesis."""
     E = essential_matrix(cam_from_world @ query.views.inverse())
     tracks = query.tracks
     errors = sampson_error(E[tracks.view], tracks.xy, query.points[tracks.point])
-    return tracks[np.abs(errors) < max_error]
+    return tracks[np.abs(errors) < max_error_px * mean_px(query, tracks.view)]
 
 
 def refine(
     query: Query, cam_from_world: Rigid3, options: LocalizerOptions
 ) -> tuple[LatentPoints, RefinedPose | None]:
     """Stage 2 of the paper: guided matches, latent points (E1), pose (E2)."""
-    tracks = guide_matches(query, cam_from_world, options.max_guided_error_px * query.px)
-    latent = triangulate_robust(query.views, tracks, max_error=options.max_ray_error_px * query.px)
+    tracks = guide_matches(query, cam_from_world, options.max_guided_error_px)
+    latent = triangulate_robust(query.views, tracks, max_error_px=options.max_ray_error_px)
     if len(latent.point) == 0:
         return latent, None
     refined = refine_pose(
         cam_from_world,
         latent.points3d,
         query.points[latent.point],
-        point_covariance=latent.covariance,
+        # For image noise of 1 instead of one pixel.
+        point_covariance=latent.covariance / query.px**2,
         sigma=options.keypoint_sigma_px * query.px,
         max_error=options.max_reprojection_error_px * query.px,
     )

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,7 +23,7 @@ def all_tracks(points2d: np.ndarray) -> Tracks:
     num_views, num_points = points2d.shape[:2]
     point = np.repeat(np.arange(num_points), num_views)
     view = np.tile(np.arange(num_views), num_points)
-    return Tracks(point, view, points2d[view, point])
+    return Tracks(point, view, points2d[view, point], np.ones(len(point)))
 
 
 def noisy(scene: Scene, sigma: float) -> Tracks:
@@ -94,7 +96,7 @@ def test_triangulation_minimises_the_objective_of_proposition_2() -> None:
             return proposition_2(v[:2], v[2], gammas, views_from_first, printed=printed)
 
         e1 = float((residuals[tracks.point == j] ** 2).sum())
-        assert objective(at) == pytest.approx(e1, rel=1e-6)  # it is E1 of eq. 14
+        assert objective(at) == pytest.approx(e1, rel=1e-6)  # it is E1 of eq. 13
         best = minimize(
             objective, at, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-14}
         )
@@ -121,7 +123,7 @@ def test_covariance_predicts_the_scatter() -> None:
 
 def test_parallel_rays_give_a_point_of_huge_uncertainty() -> None:
     views = Rigid3.from_center(np.tile(np.eye(3), (2, 1, 1)), np.array([[0, 0, 0], [1.0, 0, 0]]))
-    tracks = Tracks(np.array([0, 0]), np.array([0, 1]), np.zeros((2, 2)))
+    tracks = Tracks(np.array([0, 0]), np.array([0, 1]), np.zeros((2, 2)), np.ones(2))
     points3d, covariance = triangulate(views, tracks)
     assert np.isfinite(points3d).all()
     assert np.isfinite(covariance).all()
@@ -131,7 +133,9 @@ def test_parallel_rays_give_a_point_of_huge_uncertainty() -> None:
 def test_two_views_at_one_place_give_finite_numbers() -> None:
     R = rotation_from_vector(np.array([[0, 0, 0], [0, 0.1, 0]]))
     views = Rigid3.from_center(R, np.zeros((2, 3)))
-    tracks = Tracks(np.array([0, 0]), np.array([0, 1]), np.array([[0, 0], [-0.1003, 0]]))
+    tracks = Tracks(
+        np.array([0, 0]), np.array([0, 1]), np.array([[0, 0], [-0.1003, 0]]), np.ones(2)
+    )
     points3d, covariance = triangulate(views, tracks)
     assert np.isfinite(points3d).all()
     assert np.isfinite(covariance).all()
@@ -142,7 +146,7 @@ def test_a_point_behind_its_views_is_refused() -> None:
     behind = np.array([0.5, 0.2, -3.0])
     xy = np.stack([(behind - c)[:2] / (behind - c)[2] for c in views.center])
     latent = triangulate_robust(
-        views, Tracks(np.array([0, 0]), np.array([0, 1]), xy), max_error=0.01
+        views, Tracks(np.array([0, 0]), np.array([0, 1]), xy, np.ones(2)), max_error_px=0.01
     )
     assert len(latent.point) == 0
 
@@ -156,7 +160,7 @@ def test_wrong_observations_are_dropped_and_the_others_kept() -> None:
         0.1, 0.3, (wrong.sum(), 2)
     )
     tracks = all_tracks(points2d)
-    latent = triangulate_robust(scene.views_from_world, tracks, max_error=3e-3)
+    latent = triangulate_robust(scene.views_from_world, tracks, max_error_px=3e-3)
     kept = np.zeros((6, 50), bool)
     kept[latent.tracks.view, latent.tracks.point] = True
     assert not (kept & wrong).any()
@@ -169,14 +173,14 @@ def test_points_seen_once_are_left_out() -> None:
     scene = make_scene("once", num_points=3, num_views=3)
     tracks = all_tracks(scene.points2d)
     tracks = tracks[(tracks.point != 1) | (tracks.view == 0)]
-    latent = triangulate_robust(scene.views_from_world, tracks, max_error=1e-3)
+    latent = triangulate_robust(scene.views_from_world, tracks, max_error_px=1e-3)
     np.testing.assert_array_equal(latent.point, [0, 2])
 
 
 def test_no_tracks_give_no_points() -> None:
     scene = make_scene("none", num_points=1)
     empty = all_tracks(scene.points2d)[np.zeros(4, bool)]
-    assert len(triangulate_robust(scene.views_from_world, empty, max_error=1e-3).point) == 0
+    assert len(triangulate_robust(scene.views_from_world, empty, max_error_px=1e-3).point) == 0
 
 
 def test_jacobian_of_the_projection_equals_the_numeric_one() -> None:
@@ -192,3 +196,22 @@ def test_jacobian_of_the_projection_equals_the_numeric_one() -> None:
         np.testing.assert_allclose(J[:, :, axis], (plus - minus) / 2e-6, atol=1e-8)
     expected = homogeneous(tracks.xy + r)
     np.testing.assert_allclose(expected[:, 2], 1.0)
+
+
+def test_a_pixel_is_as_large_as_its_view_sees_it() -> None:
+    """The same error counts less in a view with large pixels, and may be too much in a fine one."""
+    scene = make_scene("pixels", num_points=20, num_views=3)
+    points2d = scene.points2d.copy()
+    points2d[2] += 0.01
+    tracks = all_tracks(points2d)
+    coarse = replace(tracks, px=np.where(tracks.view == 2, 0.05, 0.001))
+    fine = replace(tracks, px=np.full(len(tracks), 0.001))
+    error_coarse, error_fine = (
+        np.linalg.norm(triangulate(scene.views_from_world, t)[0] - scene.points3d, axis=1)
+        for t in (coarse, fine)
+    )
+    assert (error_coarse < 0.1 * error_fine).all()
+    kept = triangulate_robust(scene.views_from_world, coarse, max_error_px=2).tracks
+    assert len(kept) == len(tracks)
+    kept = triangulate_robust(scene.views_from_world, fine, max_error_px=2).tracks
+    assert len(kept) < len(tracks)

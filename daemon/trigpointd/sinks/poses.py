@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trigpoint.poses import format_pose
-
 from trigpoint.errors import ConfigError, SourceError
 from trigpoint.frame import Localized
+from trigpoint.poses import format_pose
 from trigpointd.pipeline import Output
 
 

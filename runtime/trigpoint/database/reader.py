@@ -1,4 +1,4 @@
-"""Reading a map: rows and descriptors are used where they lie in the mapping."""
+"""Reading a map: records are read where they lie in the mapping and converted to float32."""
 
 from __future__ import annotations
 

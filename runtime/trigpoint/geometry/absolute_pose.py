@@ -1,6 +1,6 @@
-"""Robust pose of a camera from points known in the world: P3P in LO-RANSAC.
+"""Robust pose of a camera from points known in the world: P3P in RANSAC.
 
-PoseLib's, or OpenCV's; both are seeded.
+PoseLib's LO-RANSAC, or OpenCV's RANSAC; both draw the same samples every time.
 """
 
 from __future__ import annotations
@@ -60,8 +60,9 @@ def _poselib(points3d: Array, points2d: Array, max_error: float) -> Rigid3 | Non
 
 
 def _opencv(points3d: Array, points2d: Array, max_error: float) -> Rigid3 | None:
+    origin = points3d.mean(axis=0)  # far from it OpenCV loses digits
     found, rotation_vector, t, inliers = cv2.solvePnPRansac(
-        points3d,
+        points3d - origin,
         points2d,
         np.eye(3),
         np.zeros(4),
@@ -73,4 +74,5 @@ def _opencv(points3d: Array, points2d: Array, max_error: float) -> Rigid3 | None
     if not found or inliers is None or len(inliers) < MIN_POINTS:
         return None
     R, _ = cv2.Rodrigues(rotation_vector)
-    return Rigid3(np.asarray(R, np.float64), np.asarray(t, np.float64).ravel())
+    cam_from_origin = Rigid3(np.asarray(R, np.float64), np.asarray(t, np.float64).ravel())
+    return Rigid3(cam_from_origin.R, cam_from_origin.apply(-origin))

@@ -11,6 +11,10 @@ from trigpoint.rigid import Rigid3, rotate, rotation_from_vector, skew
 
 Array = NDArray[np.float64]
 
+MIN_POINTS = 4
+PRIOR_DOF = 6.0  # observations' worth of trust in the expected noise: few points may fit too well
+CAUCHY = 2.0  # where Cauchy's loss bends, in standard deviations
+
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
@@ -106,8 +110,9 @@ def refine_pose(
     Returns
     -------
     RefinedPose or None
-        None where fewer than three points are left or they do not determine the pose. The
-        covariance is the inverse information matrix scaled by the measured residuals.
+        None where fewer than four points are left or they do not determine the pose. The covariance
+        is the inverse information matrix, scaled by the measured residuals and, where these are
+        few, by what `sigma` promises.
     """
 
     def evaluate(pose: Rigid3) -> tuple[float, Array, Array, Array, NDArray[np.bool_]]:
@@ -129,7 +134,7 @@ def refine_pose(
         weight = np.where(inliers, 1 / (1 + square / CAUCHY**2), 0.0)
         H = np.einsum("m,mki,mkj->ij", weight, J, J, optimize=True)
         g = np.einsum("m,mki,mk->i", weight, J, r, optimize=True)
-        if inliers.sum() < 3 or not np.linalg.cond(H) < 1e14:
+        if inliers.sum() < MIN_POINTS or not _is_determined(H):
             return None
         step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
         candidate = perturb(cam_from_world, step)
@@ -147,9 +152,6 @@ def refine_pose(
     return _with_covariance(cam_from_world, r, J, square, inliers, sigma)
 
 
-CAUCHY = 2.0  # where Cauchy's loss bends, in standard deviations
-
-
 def _with_covariance(
     cam_from_world: Rigid3,
     r: Array,
@@ -159,18 +161,24 @@ def _with_covariance(
     sigma: float,
 ) -> RefinedPose | None:
     """Sandwich-free M-estimator covariance: information of the weighted points, scaled."""
-    if inliers.sum() < 4:
+    if inliers.sum() < MIN_POINTS:
         return None
     weight = np.where(inliers, 1 / (1 + square / CAUCHY**2), 0.0)
     H = np.einsum("m,mki,mkj->ij", weight, J, J, optimize=True)
-    if not np.linalg.cond(H) < 1e14:
+    if not _is_determined(H):
         return None
-    dof = 2 * weight.sum() - 6
-    variance = float((weight * square).sum()) / max(dof, 1.0)
+    dof = max(2 * weight.sum() - 6, 0.0)
+    variance = (float((weight * square).sum()) + PRIOR_DOF) / (dof + PRIOR_DOF)
     covariance = np.linalg.inv(H) * variance
     return RefinedPose(
         cam_from_world, (covariance + covariance.T) / 2, inliers, sigma * float(np.sqrt(variance))
     )
+
+
+def _is_determined(H: Array) -> bool:
+    """Say whether the normal matrix is regular, whatever the unit of length is."""
+    scale = np.sqrt(np.diag(H))
+    return bool((scale > 0).all() and np.linalg.cond(H / np.outer(scale, scale)) < 1e12)
 
 
 def _inverse_cholesky(S: Array) -> Array:

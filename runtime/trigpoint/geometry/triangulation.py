@@ -26,22 +26,25 @@ class Tracks:
         Which view.
     xy : (P, 2) float64
         Where, in normalised image coordinates.
+    px : (P,) float64
+        The size of a pixel there: views differ in focal length, and so in how fine they see.
     """
 
     point: Index
     view: Index
     xy: Array
+    px: Array
 
     def __len__(self) -> int:
         return len(self.point)
 
     def __getitem__(self, index: NDArray[np.generic]) -> Tracks:
-        return Tracks(self.point[index], self.view[index], self.xy[index])
+        return Tracks(self.point[index], self.view[index], self.xy[index], self.px[index])
 
     def groups(self) -> tuple[Index, Index]:
         """Return the points that occur (M,) and where each one's observations start (M,)."""
-        points, starts = np.unique(self.point, return_index=True)
-        return points, starts
+        starts = np.flatnonzero(np.diff(self.point, prepend=-1))
+        return self.point[starts], starts
 
     def of_length(self, min_length: int) -> Tracks:
         """Keep the points with at least so many observations."""
@@ -61,7 +64,7 @@ class LatentPoints:
     points3d : (M, 3) float64
         In the world.
     covariance : (M, 3, 3) float64
-        For observations with unit variance; scale by the variance of the image noise.
+        For image noise of one pixel; scale by the variance of the noise in px^2.
     tracks : Tracks
         The observations they agree with, two at least for each.
     """
@@ -75,15 +78,15 @@ class LatentPoints:
 def intersect_rays(views_from_world: Rigid3, tracks: Tracks) -> Array:
     """Points (M, 3) nearest to all their rays: a linear first estimate.
 
-    For each point the solution of sum (I - d d^T) X = sum (I - d d^T) c, as in Proposition 1. Rays
-    that are nearly parallel give a point far away, not an error.
+    For each point the solution of sum (I - d d^T) X = sum (I - d d^T) c, as in Proposition 1, with
+    weights 1 / px^2. Rays that are nearly parallel give a point far away, not an error.
     """
     _, starts = tracks.groups()
     R = views_from_world.R[tracks.view]
     d = rotate(np.swapaxes(R, 1, 2), homogeneous(tracks.xy))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     c = views_from_world.center[tracks.view]
-    normal = np.eye(3) - d[:, :, None] * d[:, None, :]
+    normal = (np.eye(3) - d[:, :, None] * d[:, None, :]) / tracks.px[:, None, None] ** 2
     A = np.add.reduceat(normal, starts)
     b = np.add.reduceat(rotate(normal, c), starts)
     # Parallel rays leave A singular along themselves: a tiny pull to the mean center settles it.
@@ -112,9 +115,9 @@ def project_tracks(
     Returns
     -------
     residuals : (P, 2) float64
-        Projection minus observation.
+        Projection minus observation, in px.
     jacobians : (P, 2, 3) float64
-        Of the projection by the point.
+        Of the projection by the point, in px.
     in_front : (P,) bool
     """
     _, starts = tracks.groups()
@@ -124,8 +127,8 @@ def project_tracks(
     in_front = Y[:, 2] > 0
     z = np.where(in_front, Y[:, 2], 1.0)
     xy = Y[:, :2] / z[:, None]
-    jacobians = (R[:, :2] - xy[:, :, None] * R[:, 2:]) / z[:, None, None]
-    return xy - tracks.xy, jacobians, in_front
+    jacobians = (R[:, :2] - xy[:, :, None] * R[:, 2:]) / (z * tracks.px)[:, None, None]
+    return (xy - tracks.xy) / tracks.px[:, None], jacobians, in_front
 
 
 def triangulate(
@@ -133,8 +136,8 @@ def triangulate(
 ) -> tuple[Array, Array]:
     """Triangulate every point from all its observations.
 
-    Minimises E1 (paper, eq. 14): the sum of squared distances, in the image, of a point's
-    projections from its observations. That is the objective of Proposition 2, which writes it in
+    Minimises E1 (paper, eq. 13): the sum of squared distances, in px, of a point's projections from
+    its observations. That is the objective of Proposition 2, which writes it in
     the first view's point and depth: the third term of its sum must read rho^2 |g|^2 where the
     paper prints rho |g|^2, since |rho R g + T|^2 = rho^2 |g|^2 + |T|^2 + 2 rho g^T R^T T. Over
     X in the world it is the same minimum without singling out a view. Gauss-Newton from
@@ -154,15 +157,15 @@ def triangulate(
     points3d : (M, 3) float64
         In the order of `tracks.groups()`; for parallel rays some far point.
     covariance : (M, 3, 3) float64
-        Inverse of the normal matrix: the covariance for unit image noise. Huge, never infinite,
-        where the rays are near parallel.
+        Inverse of the normal matrix: the covariance for image noise of one pixel. Huge, never
+        infinite, where the rays are near parallel.
     """
     _, starts = tracks.groups()
     X = intersect_rays(views_from_world, tracks)
 
     def evaluate(X: Array) -> tuple[Array, Array, Array]:
         r, J, in_front = project_tracks(views_from_world, tracks, X)
-        squares = np.where(in_front, (r**2).sum(axis=1), 1e6)
+        squares = np.where(in_front, (r**2).sum(axis=1), 1e12)
         J = np.where(in_front[:, None, None], J, 0.0)
         H = np.add.reduceat(np.swapaxes(J, 1, 2) @ J, starts)
         g = np.add.reduceat((np.swapaxes(J, 1, 2) @ r[:, :, None])[:, :, 0], starts)
@@ -190,13 +193,13 @@ def triangulate(
 
 
 def triangulate_robust(
-    views_from_world: Rigid3, tracks: Tracks, *, max_error: float
+    views_from_world: Rigid3, tracks: Tracks, *, max_error_px: float
 ) -> LatentPoints:
     """Triangulate points whose observations may be wrong.
 
     The worst observation of a point is dropped, and the point triangulated again, while any is
-    farther than `max_error` (units of the observations) from its projection, or behind its view. A
-    point ends with at least two observations or not at all.
+    farther than `max_error_px` from its projection, or behind its view. A point ends with at least
+    two observations or not at all.
     """
     active = tracks.of_length(2)
     settled: list[Tracks] = []
@@ -207,7 +210,7 @@ def triangulate_robust(
         r, _, in_front = project_tracks(views_from_world, active, X)
         errors = np.where(in_front, np.sqrt((r**2).sum(axis=1)), np.inf)
         worst = np.maximum.reduceat(errors, starts)
-        done = np.repeat(worst <= max_error, lengths)
+        done = np.repeat(worst <= max_error_px, lengths)
         settled.append(active[done])
         is_worst = errors == np.repeat(worst, lengths)
         active = active[~done & ~is_worst].of_length(2)
@@ -218,11 +221,13 @@ def triangulate_robust(
 
 def _concatenate(parts: list[Tracks]) -> Tracks:
     if not parts:
-        return Tracks(np.empty(0, np.intp), np.empty(0, np.intp), np.empty((0, 2)))
+        none = np.empty(0, np.intp)
+        return Tracks(none, none, np.empty((0, 2)), np.empty(0))
     point = np.concatenate([part.point for part in parts])
     order = np.argsort(point, kind="stable")
     return Tracks(
         point[order],
         np.concatenate([part.view for part in parts])[order],
         np.concatenate([part.xy for part in parts])[order],
+        np.concatenate([part.px for part in parts])[order],
     )
