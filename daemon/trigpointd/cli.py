@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import sys
@@ -15,10 +16,12 @@ import typer
 
 from trigpoint.errors import TrigpointError
 from trigpoint.poses import format_pose
-from trigpointd.config import Config, LogConfig, SourceConfig, ZenohConfig, load_config
+from trigpoint.text import open_text
+from trigpointd.config import Config, LogConfig, ModelConfig, SourceConfig, ZenohConfig, load_config
 from trigpointd.service import open_pipeline, open_source, run
 from trigpointd.sinks.base import Sink
 from trigpointd.sinks.poses import PoseFile
+from trigpointd.sinks.zenoh import make_settings
 from trigpointd.watch import Received, subscribe
 
 app = typer.Typer(
@@ -54,10 +57,12 @@ def run_command(
 
 @app.command()
 def check_config(config: Annotated[Path, typer.Argument(help="Settings, a TOML file.")]) -> None:
-    """Check the settings, and open all that they name."""
+    """Check the settings; open the network, the map and the source, but nothing for writing."""
     settings = load_config(config)
+    if settings.zenoh is not None:
+        make_settings(settings.zenoh)
     with open_pipeline(settings):
-        open_source(settings)
+        asyncio.run(open_source(settings).close())
     print(f"{config}: good")
 
 
@@ -70,11 +75,13 @@ def replay(
         Path | None, typer.Option(help="Write `time_ns qw qx qy qz tx ty tz`, cam_from_world.")
     ] = None,
     topic: Annotated[str | None, typer.Option(help="The images' topic.")] = None,
+    model: Annotated[Path | None, typer.Option(help="A feature network; ours by default.")] = None,
 ) -> None:
     """Localize every frame of a recording, as fast as it goes."""
     config = Config(
         map=map_,
         source=SourceConfig(type="mcap", path=recording, image_topic=topic),
+        model=ModelConfig(path=model),
         log=None if log is None else LogConfig(path=log),
     )
     sinks: list[Sink] = [] if poses is None else [PoseFile(poses)]
@@ -103,7 +110,7 @@ def watch(
         multicast_scouting=not endpoints,
     )
     with ExitStack() as stack:
-        file = None if poses is None else stack.enter_context(poses.open("w", buffering=1))
+        file = None if poses is None else stack.enter_context(open_text(poses))
         for received in subscribe(config, key, exit_with_daemon=exit_with_daemon):
             if isinstance(received, str):
                 print(f"trigpointd: {received}", file=sys.stderr)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -74,7 +75,7 @@ class ZenohConfig(Section):
 class LogConfig(Section):
     """The MCAP log."""
 
-    path: Path
+    path: Path  # strftime's %Y, %m, %d, %H, %M, %S stand for the time of the start
     frames: bool = True  # input images too, so that the log can be replayed
     overwrite: bool = False
 
@@ -102,7 +103,8 @@ def load_config(path: Path) -> Config:
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{path} is not TOML: {error}") from error
     try:
-        config = Config.model_validate(tables)
+        # As JSON, of whose types TOML's are, so that a strict check still takes text for a path.
+        config = Config.model_validate_json(json.dumps(tables, default=str), strict=True)
     except ValidationError as error:
         raise ConfigError(f"{path}: {_explain(error)}") from error
     except ConfigError as error:  # from LocalizerOptions
@@ -138,14 +140,12 @@ def _explain(error: ValidationError) -> str:
 
 def _keys(loc: tuple[int | str, ...]) -> list[str]:
     """List the keys of the table at a place in the file."""
-    if loc == ("localizer",):
-        return [field.name for field in dataclasses.fields(LocalizerOptions)]
-    sections: dict[str, type[Section]] = {
-        "source": SourceConfig,
-        "camera": CameraConfig,
-        "model": ModelConfig,
-        "zenoh": ZenohConfig,
-        "log": LogConfig,
-    }
-    section = sections[str(loc[0])] if loc else Config
+    section: Any = Config
+    for part in loc:
+        annotation = section.model_fields[part].annotation
+        section = next(
+            kind for kind in (annotation, *get_args(annotation)) if isinstance(kind, type)
+        )
+    if dataclasses.is_dataclass(section):
+        return [field.name for field in dataclasses.fields(section)]
     return list(section.model_fields)

@@ -8,12 +8,12 @@ import logging
 import signal
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from trigpoint.database.reader import MapReader
-from trigpoint.errors import SourceError, TrigpointError
+from trigpoint.errors import TrigpointError
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpointd.config import Config
@@ -44,28 +44,21 @@ class Totals:
 def run(config: Config, extra_sinks: Sequence[Sink] = ()) -> Totals:
     """Run until the recording ends or SIGTERM or SIGINT comes; everything is closed in order."""
     with ExitStack() as stack:
-        pipeline = stack.enter_context(open_pipeline(config))
-        source = open_source(config)
         sinks = list(extra_sinks)
         for sink in extra_sinks:
             stack.callback(sink.close)
+        pipeline = stack.enter_context(open_pipeline(config))
+        source = open_source(config)
         if config.log is not None:
-            log = McapLog(
-                config.log.path,
-                config.base_key,
-                frames=config.log.frames,
-                overwrite=config.log.overwrite,
-            )
-            stack.callback(log.close)
-            sinks.append(log)
+            sinks.append(McapLog.from_config(config.log, config.base_key))
+            stack.callback(sinks[-1].close)
+        first = None
         if config.zenoh is not None:
             zenoh = ZenohSink(config.zenoh, config.base_key)
             stack.callback(zenoh.close)
             sinks.append(zenoh)
-            wait_s = config.zenoh.wait_for_subscriber_s
-            if wait_s > 0 and not zenoh.wait_for_subscriber(wait_s):
-                _log.warning("nobody has subscribed to the poses in %g s; going on", wait_s)
-        return asyncio.run(_run_until_signal(source, pipeline, sinks))
+            first = zenoh.wait_for_subscriber(config.zenoh.wait_for_subscriber_s)
+        return asyncio.run(_run_until_signal(source, pipeline, sinks, first))
 
 
 @contextlib.contextmanager
@@ -83,7 +76,12 @@ def open_source(config: Config) -> Source:
     return McapSource(source.path, image_topic=source.image_topic, rate=source.rate)
 
 
-async def _run_until_signal(source: Source, pipeline: Pipeline, sinks: Sequence[Sink]) -> Totals:
+async def _run_until_signal(
+    source: Source,
+    pipeline: Pipeline,
+    sinks: Sequence[Sink],
+    first: Coroutine[None, None, None] | None,
+) -> Totals:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -91,9 +89,22 @@ async def _run_until_signal(source: Source, pipeline: Pipeline, sinks: Sequence[
     notify("READY=1")
     _log.info("localizing")
     try:
+        if first is not None:
+            await _unless(stop, first)
         return await serve(source, pipeline, sinks, stop)
     finally:
         notify("STOPPING=1")
+
+
+async def _unless(stop: asyncio.Event, work: Coroutine[None, None, None]) -> None:
+    """Do something, but not on once `stop` is set."""
+    working = asyncio.create_task(work)
+    stopping = asyncio.create_task(stop.wait())
+    await asyncio.wait([working, stopping], return_when=asyncio.FIRST_COMPLETED)
+    stopping.cancel()
+    if working.cancel():
+        return
+    working.result()
 
 
 async def serve(
@@ -102,33 +113,31 @@ async def serve(
     """Localize frames until the source ends or `stop` is set; what is in work is published."""
     slot = Latest[Captured](lossless=not source.live)
     totals = Totals()
+    feeding = asyncio.create_task(_feed(source, slot))
+    stopping = asyncio.create_task(_cancel_on(stop, feeding))
     try:
-        async with asyncio.TaskGroup() as group:
-            feeding = group.create_task(_feed(source, slot))
-            stopping = group.create_task(_cancel_on(stop, feeding))
-            await _localize(slot, pipeline, list(sinks), totals)
-            stopping.cancel()
+        await _localize(slot, pipeline, list(sinks), totals)
     finally:
+        stopping.cancel()
+        feeding.cancel()
+        await asyncio.wait([feeding])
         await source.close()
-    if not feeding.cancelled() and (error := feeding.result()) is not None:
-        raise error
+    if not feeding.cancelled():
+        feeding.result()  # raises what ended the source
     return totals
 
 
-async def _feed(source: Source, slot: Latest[Captured]) -> SourceError | None:
+async def _feed(source: Source, slot: Latest[Captured]) -> None:
     """Bring frames to the slot; a source that fails ends the stream, after what it brought."""
     try:
         async with contextlib.aclosing(source.frames()) as frames:
             async for captured in frames:
                 await slot.put(captured)
-    except SourceError as error:
-        return error
     finally:
         await slot.close()
-    return None
 
 
-async def _cancel_on(stop: asyncio.Event, task: asyncio.Task[SourceError | None]) -> None:
+async def _cancel_on(stop: asyncio.Event, task: asyncio.Task[None]) -> None:
     await stop.wait()
     _log.info("stopping")
     task.cancel()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from trigpoint.errors import SourceError
+from trigpoint.errors import ConfigError, SourceError
 from trigpointd.config import ZenohConfig
 from trigpointd.messages.cdr import PoseStamped, decode_pose
 from trigpointd.sinks.zenoh import open_session
@@ -42,6 +42,10 @@ def subscribe(
         if sample.kind == zenoh.SampleKind.DELETE:
             inbox.put(None)
 
+    try:
+        zenoh.KeyExpr(key)
+    except zenoh.ZError as error:
+        raise ConfigError(f"{key!r} is no key expression, such as trigpoint/**/pose") from error
     with open_session(config) as session:
         # The token is undeclared after the last pose, on the same session: it cannot overtake.
         alive = key.removesuffix("/pose") + "/alive"

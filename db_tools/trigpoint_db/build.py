@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -37,14 +39,10 @@ def check_files(names: Iterable[str], folder: Path) -> None:
 
 def read_frame(path: Path, camera: Camera, name: str) -> Frame:
     """Read an image file that a camera has taken."""
-    image = read_gray(path)
-    height, width = image.shape
-    if (width, height) != (camera.width, camera.height):
-        raise ConfigError(
-            f"{path} has {width} x {height} px, its camera {camera.width} x {camera.height}: "
-            "use the images the camera was calibrated with"
-        )
-    return Frame(image, camera, name=name)
+    try:
+        return Frame(read_gray(path), camera, name=name)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def build_map(
@@ -56,11 +54,9 @@ def build_map(
     max_keypoints: int = 1024,
 ) -> int:
     """Write a new map; it appears under its name when it is complete. Returns the image count."""
-    if path.exists():
-        raise ConfigError(f"{path} exists; remove it first, or add to it with --append")
-    partial = path.with_name(path.name + ".partial")
-    lock = partial.with_name(partial.name + "-lock")
-    partial.unlink(missing_ok=True)
+    refuse_existing(path)
+    # Under a name of its own, so that two builds at once do not meet.
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         with MapWriter.create(partial, model.identity) as writer:
             for image in images:
@@ -68,11 +64,19 @@ def build_map(
                 if len(writer) % COMMIT_EVERY == 0:
                     writer.commit()
             count = len(writer)
+        refuse_existing(path)
         partial.rename(path)
     finally:
-        partial.unlink(missing_ok=True)
-        lock.unlink(missing_ok=True)
+        for leftover in (partial, partial.with_name(partial.name + "-lock")):
+            with contextlib.suppress(OSError):
+                leftover.unlink()
     return count
+
+
+def refuse_existing(path: Path) -> None:
+    """Keep a map that is there."""
+    if path.exists():
+        raise ConfigError(f"{path} exists; remove it first, or add to it with --append")
 
 
 def append_map(

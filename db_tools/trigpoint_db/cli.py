@@ -7,6 +7,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -19,12 +20,13 @@ from rich.table import Table
 
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
-from trigpoint.errors import ConfigError, TrigpointError
+from trigpoint.errors import ConfigError, SourceError, TrigpointError
 from trigpoint.frame import Localized
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import LocalizerOptions
+from trigpoint.text import open_text
 from trigpoint_db.build import append_map, build_map, check_files, select_images
 from trigpoint_db.demo import make_demo
 from trigpoint_db.evaluate import evaluate, plot_paths
@@ -32,7 +34,7 @@ from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import Outcome, localize_images
 from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
-from trigpoint_db.recording import RecordedImage, write_recording
+from trigpoint_db.recording import FORMATS, RecordedImage, write_recording
 
 T = TypeVar("T")
 app = typer.Typer(
@@ -101,26 +103,35 @@ def localize(
 ) -> None:
     """Localize images; OK poses go to a file, what came of every query to another."""
     wanted = read_queries(queries)
+    if not wanted:
+        raise ConfigError(f"{queries} names no images")
     check_files((query.name for query in wanted), images)
     network = FeatureModel.load(model)
-    with MapReader.open(map_, network.identity) as reader:
-        outcomes = list(_localize(reader, network, wanted, images, anchors))
-    write_poses(
-        poses,
-        {o.name: o.result.cam_from_world for o in outcomes if isinstance(o.result, Localized)},
-    )
-    if results is not None:
-        results.write_text("".join(json.dumps(o.to_json()) + "\n" for o in outcomes))
+    with MapReader.open(map_, network.identity) as reader, ExitStack() as stack:
+        if len(reader) == 0:
+            raise ConfigError(f"{map_} holds no images; add some: trigpoint-db build --append")
+        lines = None if results is None else stack.enter_context(open_text(results))
+        outcomes = []
+        for outcome in _localize(reader, network, wanted, images, anchors):
+            outcomes.append(outcome)
+            if lines is not None:
+                lines.write(json.dumps(outcome.to_json()) + "\n")
+    found = {o.name: o.result.cam_from_world for o in outcomes if isinstance(o.result, Localized)}
+    write_poses(poses, found)
     counts = Counter(outcome.reason for outcome in outcomes)
+    others = ", ".join(f"{n} {reason}" for reason, n in counts.items() if reason != "LOCALIZED")
     if as_json:
         print(json.dumps({"num_queries": len(outcomes), "outcomes": counts}))
     else:
-        print(f"{counts['LOCALIZED']} of {len(outcomes)} localized", end="")
-        others = [f"{n} {reason}" for reason, n in counts.items() if reason != "LOCALIZED"]
-        print("".join(f", {other}" for other in others))
+        print(f"{len(found)} of {len(outcomes)} localized" + (f", {others}" if others else ""))
     bad = [outcome for outcome in outcomes if outcome.result is None]
     if bad:
-        raise ConfigError(f"{len(bad)} images could not be used, such as {bad[0].error}")
+        raise SourceError(f"{len(bad)} images could not be used, such as {bad[0].error}")
+    if not found:
+        raise ConfigError(
+            f"no query was localized: {others}; --results says more of each, and whether the map "
+            "shows their place only you can tell"
+        )
 
 
 def _localize(
@@ -242,12 +253,11 @@ def record(
 
 
 def _image_names(folder: Path) -> list[str]:
-    suffixes = {".jpg", ".jpeg", ".png"}
     if not folder.is_dir():
         raise ConfigError(f"no such folder: {folder}")
-    names = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in suffixes)
+    names = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in FORMATS)
     if not names:
-        raise ConfigError(f"{folder} holds no JPEG or PNG images")
+        raise ConfigError(f"{folder} holds no images ({', '.join(FORMATS)})")
     return names
 
 

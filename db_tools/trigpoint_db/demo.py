@@ -53,7 +53,10 @@ def render_images(
     room_seed: int, cams_from_world: Rigid3, folder: Path, *, noise_seed: int, num_jobs: int = 2
 ) -> Iterator[PosedImage]:
     """Render one JPEG a pose into a folder, yielding each as it is done, in order."""
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot make the folder {folder}: {error.strerror}") from error
     poses = [cams_from_world[i] for i in range(len(cams_from_world))]
     work = partial(_render_one, room_seed, folder, noise_seed)
     # OpenCV's threads do not survive a fork.

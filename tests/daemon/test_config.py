@@ -73,6 +73,9 @@ path = "/var/log/trigpoint.mcap"
         (MINIMAL.replace("mcap\"\npath", "video\"\npath"), "'source.type': Input should be 'mcap'"),
         ("base_key = '/x/'\n" + MINIMAL, "'base_key'"),
         (MINIMAL + "rate = nan", "'source.rate'"),
+        (MINIMAL + "[localizer]\nnum_anchors = '20'", "'localizer.num_anchors': .*valid integer"),
+        (MINIMAL + "[log]\npath = 'a'\nframes = 0", "'log.frames': .*valid boolean"),
+        (MINIMAL + "[localizer]\nmin_inlier_ratio = 40", "min_inlier_ratio must be at most 1"),
         ("map = ", "is not TOML"),
     ],
 )  # fmt: skip

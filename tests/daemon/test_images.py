@@ -285,5 +285,5 @@ def test_a_calibration_that_cannot_be_used_says_why(unusable: Calibration, compl
 
 
 def test_an_image_of_another_size_than_its_calibration_is_an_error() -> None:
-    with pytest.raises(SourceError, match="64 x 48 px, but its calibration is for 640 x 480"):
+    with pytest.raises(SourceError, match=r"64 x 48 px, but its camera.s calibration is for 640"):
         to_frame(Image(0, "", jpeg()), calibration().camera(), 0, "")

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,10 @@ import cv2
 import numpy as np
 import pytest
 import zenoh
+from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
 from mcap_ros2.decoder import DecoderFactory as RosDecoders
 from rosbags.typesys import Stores, get_typestore
@@ -39,7 +43,9 @@ def run(program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def write_config(folder: Path, demo: Demo, *, port: int | None = None, more: str = "") -> Path:
+def write_config(
+    folder: Path, map_: Path, recording: Path, *, port: int | None = None, more: str = ""
+) -> Path:
     zenoh_table = "" if port is None else f"""
 [zenoh]
 connect = ["tcp/127.0.0.1:{port}"]
@@ -48,7 +54,7 @@ wait_for_subscriber_s = 20
 """  # fmt: skip
     path = folder / "trigpointd.toml"
     path.write_text(f"""
-map = "{demo.map}"
+map = "{map_}"
 base_key = "trigpoint/test"
 [camera]
 position_m = [0.12, 0.0, 0.03]
@@ -58,7 +64,7 @@ path = "log.mcap"
 {zenoh_table}
 [source]
 type = "mcap"
-path = "{demo.recording}"
+path = "{recording}"
 {more}
 """)
     return path
@@ -83,7 +89,12 @@ def subscriber(port: int) -> Iterator[dict[str, list[zenoh.Sample]]]:
 
 def test_a_subscriber_receives_every_pose_and_status(demo: Demo, tmp_path: Path, port: int) -> None:
     with subscriber(port) as samples:
-        done = run("trigpointd", "run", "--config", write_config(tmp_path, demo, port=port))
+        done = run(
+            "trigpointd",
+            "run",
+            "--config",
+            write_config(tmp_path, demo.map, demo.recording, port=port),
+        )
         assert done.returncode == 0, done.stderr
     statuses = [json.loads(sample.payload.to_bytes()) for sample in samples["status"]]
     localized = [status for status in statuses if status["status"] == "LOCALIZED"]
@@ -119,7 +130,7 @@ def test_a_subscriber_receives_every_pose_and_status(demo: Demo, tmp_path: Path,
 
 
 def test_the_log_opens_with_independent_readers_and_replays(demo: Demo, tmp_path: Path) -> None:
-    done = run("trigpointd", "run", "--config", write_config(tmp_path, demo))
+    done = run("trigpointd", "run", "--config", write_config(tmp_path, demo.map, demo.recording))
     assert done.returncode == 0, done.stderr
     log = tmp_path / "log.mcap"
     with log.open("rb") as stream:
@@ -151,17 +162,9 @@ def test_the_same_replay_twice_gives_the_same_bytes(demo: Demo, tmp_path: Path) 
     assert texts[0].count(b"\n") >= 15
 
 
-def wait_for_frames(log: Path, process: subprocess.Popen[str]) -> None:
-    """Return once the daemon has written frames to its log."""
-    for line in process.stderr or ():
-        if "localizing" in line:
-            break
-    while not log.exists() or log.stat().st_size < 600_000:
-        assert process.poll() is None
-
-
-def test_sigterm_ends_it_in_order(demo: Demo, tmp_path: Path) -> None:
-    config = write_config(tmp_path, demo, more="rate = 0.2")
+@contextlib.contextmanager
+def daemon(config: Path) -> Iterator[subprocess.Popen[str]]:
+    """A daemon that has begun to localize, and is ended by whoever asked for it."""
     with subprocess.Popen(
         command("trigpointd", "run", "--config", config), stderr=subprocess.PIPE, text=True
     ) as process:
@@ -169,28 +172,68 @@ def test_sigterm_ends_it_in_order(demo: Demo, tmp_path: Path) -> None:
         for line in process.stderr:
             if "localizing" in line:
                 break
-        process.send_signal(signal.SIGTERM)
-        rest = process.stderr.read()
-        assert process.wait(TIMEOUT_S) == 0
-    assert "stopping" in rest
-    with (tmp_path / "log.mcap").open("rb") as stream:
-        assert make_reader(stream).get_summary() is not None  # it was closed properly
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
-def test_after_kill_9_the_log_plays_and_the_map_verifies(demo: Demo, tmp_path: Path) -> None:
-    config = write_config(tmp_path, demo, more="rate = 4.0")
+def wait_until_larger(file: Path, num_bytes: int) -> None:
+    deadline_s = time.monotonic() + TIMEOUT_S
+    while not file.exists() or file.stat().st_size < num_bytes:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def test_sigterm_ends_it_in_order(demo: Demo, tmp_path: Path) -> None:
+    config = write_config(tmp_path, demo.map, demo.recording, more="rate = 0.5")
     log = tmp_path / "log.mcap"
-    with subprocess.Popen(
-        command("trigpointd", "run", "--config", config), stderr=subprocess.PIPE, text=True
-    ) as process:
-        wait_for_frames(log, process)
+    with daemon(config) as process:
+        wait_until_larger(log, 200_000)  # frames are written, others are still to come
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+        assert "stopping" in (process.stderr.read() if process.stderr else "")
+    with log.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None  # it was closed properly
+    assert summary.statistics is not None
+    counts = summary.statistics.channel_message_counts
+    by_topic = {channel.topic: counts[id_] for id_, channel in summary.channels.items()}
+    # What was in work has been published: a status for each image.
+    assert 1 <= by_topic["/camera/image"] < 16
+    assert by_topic["trigpoint/test/status"] == by_topic["/camera/image"]
+
+
+def test_sigterm_ends_the_wait_for_a_subscriber(demo: Demo, tmp_path: Path, port: int) -> None:
+    config = write_config(tmp_path, demo.map, demo.recording, port=port)
+    with daemon(config) as process:
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+
+
+def test_if_nobody_subscribes_it_goes_on(demo: Demo, tmp_path: Path, port: int) -> None:
+    config = write_config(tmp_path, demo.map, demo.recording, port=port)
+    config.write_text(config.read_text().replace("subscriber_s = 20", "subscriber_s = 0.2"))
+    done = run("trigpointd", "run", "--config", config)
+    assert done.returncode == 0
+    assert "nobody has subscribed to the poses in 0.2 s" in done.stderr
+
+
+def test_after_kill_9_all_but_the_last_chunk_of_the_log_plays(demo: Demo, tmp_path: Path) -> None:
+    config = write_config(tmp_path, demo.map, demo.recording, more="rate = 4.0")
+    log = tmp_path / "log.mcap"
+    with daemon(config) as process:
+        wait_until_larger(log, 600_000)
         process.kill()
-    done = run(
-        "trigpointd", "replay", log, "--map", demo.map, "--poses", tmp_path / "recovered.txt"
-    )
+    logged = 0
+    with contextlib.suppress(EndOfFile), log.open("rb") as stream:
+        for record in StreamReader(stream).records:
+            logged += isinstance(record, Message) and record.channel_id == 2
+    assert logged >= 5  # of some 80 kB each
+    poses = tmp_path / "recovered.txt"
+    done = run("trigpointd", "replay", log, "--map", demo.map, "--poses", poses)
     assert done.returncode == 0, done.stderr
-    recovered = read_poses(tmp_path / "recovered.txt")
-    assert 1 <= len(recovered) <= 16
+    assert len(read_poses(poses)) == logged
     done = run("trigpoint_db", "verify", demo.map)
     assert done.returncode == 0, done.stdout
 
@@ -229,7 +272,7 @@ def test_missing_files_are_one_line_and_exit_1(
 
 
 def test_a_port_in_use_is_one_line_and_exit_1(demo: Demo, tmp_path: Path, port: int) -> None:
-    config = write_config(tmp_path, demo)
+    config = write_config(tmp_path, demo.map, demo.recording)
     config.write_text(config.read_text() + f"[zenoh]\nlisten = ['tcp/127.0.0.1:{port}']\n")
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", port))
@@ -241,7 +284,7 @@ def test_a_port_in_use_is_one_line_and_exit_1(demo: Demo, tmp_path: Path, port: 
 
 
 def test_check_config_opens_what_is_named(demo: Demo, tmp_path: Path) -> None:
-    config = write_config(tmp_path, demo)
+    config = write_config(tmp_path, demo.map, demo.recording)
     assert run("trigpointd", "check-config", config).returncode == 0
     config.write_text(config.read_text().replace("map.tpmap", "nap.tpmap"))
     done = run("trigpointd", "check-config", config)

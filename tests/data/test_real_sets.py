@@ -6,22 +6,28 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from tests.conftest import DATA
+from tests.daemon.test_service import run, subscriber, write_config
+from trigpoint_db.demo import BODY_FROM_CAMERA
+from trigpoint_db.importers.colmap import read_model
+from trigpoint_db.poses import read_queries
 
 pytestmark = pytest.mark.skipif(
     not DATA.is_dir(), reason=f"needs the posed images in {DATA}, which are not ours to ship"
 )
 
 
-def trigpoint_db(*arguments: object) -> str:
+def trigpoint_db(*arguments: object, code: int = 0) -> str:
     done = subprocess.run(
         [sys.executable, "-m", "trigpoint_db.cli", *map(str, arguments)],
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert done.returncode == code, done.stderr
+    return done.stdout + (done.stderr if code else "")
 
 
 @pytest.mark.parametrize(
@@ -73,8 +79,37 @@ def test_frames_of_another_place_are_refused(tmp_path: Path) -> None:
     kitchen, truck = DATA / "7scenes_redkitchen", DATA / "tnt_truck"
     map_, poses = tmp_path / "m.tpmap", tmp_path / "poses.txt"
     trigpoint_db("build", map_, "--colmap", kitchen / "sparse", "--images", kitchen / "images")
-    trigpoint_db(
+    said = trigpoint_db(
         "localize", map_, "--images", truck / "images", "--queries", truck / "queries.txt",
-        "--poses", poses,
+        "--poses", poses, code=1,
     )  # fmt: skip
+    assert "no query was localized" in said
     assert poses.read_text() == ""
+
+
+def test_a_second_process_receives_every_pose_of_the_kitchen(tmp_path: Path, port: int) -> None:
+    kitchen = DATA / "7scenes_redkitchen"
+    sources = ["--colmap", kitchen / "sparse", "--images", kitchen / "images"]
+    trigpoint_db("build", tmp_path / "kitchen.tpmap", *sources, "--list", kitchen / "map.txt")
+    trigpoint_db(
+        "record", tmp_path / "kitchen.mcap", "--images", kitchen / "images",
+        "--queries", kitchen / "queries.txt", "--truth", kitchen,
+    )  # fmt: skip
+    config = write_config(
+        tmp_path, tmp_path / "kitchen.tpmap", tmp_path / "kitchen.mcap", port=port
+    )
+    with subscriber(port) as samples:
+        done = run("trigpointd", "run", "--config", config)
+    assert done.returncode == 0, done.stderr
+    assert "29 LOCALIZED, 0 dropped" in done.stderr
+    assert len(samples["pose"]) == len(samples["status"]) == 29
+    truth = read_model(kitchen / "sparse")
+    names = [query.name for query in read_queries(kitchen / "queries.txt")]
+    centers = {image.name: (BODY_FROM_CAMERA @ image.cam_from_world).center for image in truth}
+    decode = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
+    for sample, name in zip(samples["pose"], names, strict=True):
+        message: Any = decode(
+            sample.payload.to_bytes(), "geometry_msgs/msg/PoseWithCovarianceStamped"
+        )
+        position = message.pose.pose.position
+        assert np.linalg.norm(centers[name] - [position.x, position.y, position.z]) < 0.02

@@ -100,7 +100,7 @@ def test_keypoints_move_with_the_image(model: FeatureModel) -> None:
 
 
 def test_keypoints_of_a_larger_image_are_given_in_its_own_pixels(model: FeatureModel) -> None:
-    """Scaled up four times, so that the network sees what it saw before."""
+    """Scaled up twice, so that the network sees what it saw before."""
     small = checkers(480, 640)
     large = cv2.resize(small, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
     a = model.extract(small, 300).keypoints
@@ -154,7 +154,7 @@ def test_another_network_is_a_file_away(tmp_path: Path) -> None:
         ("{}", "metadata is not this version's contract"),
         ("not json", "metadata is not this version's contract"),
         (contract().replace("standardize", "whiten"), "'whiten' is not known"),
-        (contract(descriptor_dim=128), "64 numbers, its metadata says 128"),
+        (contract(descriptor_dim=128), r"by its metadata it is \(1, 128, height, width\)"),
         (contract(vocabulary="none.npz"), "no such retrieval vocabulary"),
     ],
 )

@@ -1,9 +1,9 @@
 """The pipeline on the rendered room: what is found, what is refused, and why."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -90,14 +90,16 @@ def test_a_black_frame_is_too_dark(model: FeatureModel, reader: MapReader) -> No
     assert reason(Localizer(model, reader).localize(black)) is Reason.TOO_DARK
 
 
-def test_a_frame_with_three_features_has_too_few(model: FeatureModel, reader: MapReader) -> None:
+def test_a_frame_with_three_spots_has_too_few_features(
+    model: FeatureModel, reader: MapReader
+) -> None:
     image = np.full((480, 640), 100, np.uint8)
     for x in (160, 320, 480):
-        image[200:280, x - 30 : x + 30] = 200
-    few = Frame(image, CAMERA)
-    result = Localizer(model, reader, LocalizerOptions(max_keypoints=3)).localize(few)
+        cv2.circle(image, (x, 240), 6, 200, -1)
+    spots = Frame(np.asarray(cv2.GaussianBlur(image, (0, 0), 2), np.uint8), CAMERA)
+    result = Localizer(model, reader).localize(spots)
     assert reason(result) is Reason.FEW_FEATURES
-    assert result.statistics.num_features == 3
+    assert 3 <= result.statistics.num_features < 50
 
 
 def test_noise_is_not_a_place(model: FeatureModel, reader: MapReader) -> None:
@@ -143,15 +145,14 @@ def test_anchors_on_one_line_with_the_query_are_degenerate() -> None:
     assert average_poses(ahead[:1], unit[:1], LocalizerOptions()) is Reason.FEW_ANCHORS
 
 
-def test_a_frame_of_another_size_than_its_camera_is_an_error(
-    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
-) -> None:
-    frame = replace(flight[0][0], image=np.zeros((240, 320), np.uint8))
-    with pytest.raises(ConfigError, match="has 320 x 240 px, its camera 640 x 480"):
-        Localizer(model, reader).localize(frame)
+def test_a_frame_of_another_size_than_its_camera_is_an_error() -> None:
+    with pytest.raises(ConfigError, match=r"is 320 x 240 px, but its camera's .* 640 x 480"):
+        Frame(np.zeros((240, 320), np.uint8), CAMERA)
 
 
-@pytest.mark.parametrize("changes", [{"num_anchors": 1}, {"min_inliers": 0}, {"max_keypoints": -5}])
+@pytest.mark.parametrize(
+    "changes", [{"num_anchors": 1}, {"min_inliers": 0}, {"min_inlier_ratio": 40}]
+)
 def test_settings_out_of_range_are_errors(changes: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=next(iter(changes))):
         LocalizerOptions(**changes)  # type: ignore[arg-type]

@@ -53,7 +53,7 @@ _NS = 10**9
 
 @dataclass(frozen=True, eq=False)
 class PoseStamped:
-    """A pose as it was published; `covariance` (6, 6) is ROS's, as in `trigpoint.Localized`."""
+    """A pose as it was published; `covariance` is ROS's, as in `trigpoint.frame.Localized`."""
 
     time_ns: int
     frame_id: str

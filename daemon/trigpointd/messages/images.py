@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError, SourceError
 from trigpoint.frame import Frame
+from trigpoint.images import decode_gray
 from trigpointd.messages.cdr import CdrReader
 
 _NS = 10**9
@@ -68,27 +69,14 @@ class Image:
     step: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.time_ns < _MAX_TIME_NS:
-            raise SourceError(f"the capture time {self.time_ns} ns is out of range")
+        check_time(self.time_ns)
 
     def gray(self) -> NDArray[np.uint8]:
         """Decode the pixels to gray levels (height, width)."""
         return self._from_file() if self.encoding is None else self._from_rows(self.encoding)
 
     def _from_file(self) -> NDArray[np.uint8]:
-        buffer = np.frombuffer(self.data, np.uint8)
-        # The calibration belongs to the sensor's rows: an EXIF orientation must not turn them.
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        try:
-            image = cv2.imdecode(buffer, flags) if len(buffer) else None
-        except cv2.error as error:
-            raise SourceError(f"the compressed image cannot be decoded: {error.err}") from error
-        if image is None:
-            raise SourceError(
-                f"the compressed image of {len(buffer)} bytes is broken, cut short or in a format "
-                "other than JPEG, PNG or WebP"
-            )
-        return image.astype(np.uint8, copy=False)
+        return decode_gray(self.data)
 
     def _from_rows(self, encoding: str) -> NDArray[np.uint8]:
         if encoding not in _ENCODINGS:
@@ -133,16 +121,18 @@ class Calibration:
             raise SourceError(f"a calibration cannot be used: {error}") from error
 
 
+def check_time(time_ns: int) -> None:
+    """Refuse a time that a pose's stamp cannot hold."""
+    if not 0 <= time_ns < _MAX_TIME_NS:
+        raise SourceError(f"the capture time {time_ns} ns is out of range")
+
+
 def to_frame(image: Image, camera: Camera, time_ns: int, name: str) -> Frame:
     """Decode an image that must have its calibration's size."""
-    pixels = image.gray()
-    height, width = pixels.shape
-    if (width, height) != (camera.width, camera.height):
-        raise SourceError(
-            f"the image is {width} x {height} px, but its calibration is for "
-            f"{camera.width} x {camera.height} px"
-        )
-    return Frame(pixels, camera, time_ns, name)
+    try:
+        return Frame(image.gray(), camera, time_ns, name)
+    except ConfigError as error:
+        raise SourceError(str(error)) from error
 
 
 def parse_image(message_encoding: str, schema_name: str, data: bytes) -> Image:

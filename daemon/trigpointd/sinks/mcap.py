@@ -6,10 +6,12 @@ import contextlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Self
 
 from mcap.writer import CompressionType, Writer
 
 from trigpoint.errors import ConfigError, SourceError
+from trigpointd.config import LogConfig
 from trigpointd.messages.cdr import POSE_SCHEMA, POSE_TYPE
 from trigpointd.pipeline import Output
 from trigpointd.sources.base import Captured, Channel, Message
@@ -67,6 +69,12 @@ class McapLog:
         self._writer = Writer(self._stream, chunk_size=_CHUNK_BYTES, compression=compression)
         with self._writing():
             self._writer.start(library="trigpoint")
+
+    @classmethod
+    def from_config(cls, config: LogConfig, base_key: str) -> Self:
+        """Open the log that the settings name; %Y, %H and the like in it stand for now."""
+        path = Path(time.strftime(str(config.path)))
+        return cls(path, base_key, frames=config.frames, overwrite=config.overwrite)
 
     def publish(self, output: Output) -> None:
         """Write the messages the frame came from, if asked to, the pose and the status."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trigpoint.errors import ConfigError, SourceError
+from trigpoint.errors import SourceError
 from trigpoint.frame import Localized
 from trigpoint.poses import format_pose
+from trigpoint.text import open_text
 from trigpointd.pipeline import Output
 
 
@@ -15,10 +16,7 @@ class PoseFile:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        try:
-            self._file = path.open("w")
-        except OSError as error:
-            raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+        self._file = open_text(path)
 
     def publish(self, output: Output) -> None:
         """Write a line for a localized frame."""
@@ -26,7 +24,6 @@ class PoseFile:
             return
         try:
             self._file.write(format_pose(str(output.time_ns), output.result.cam_from_world))
-            self._file.flush()
         except OSError as error:
             raise SourceError(f"cannot write {self._path}: {error.strerror}") from error
 

@@ -21,6 +21,7 @@ from trigpoint.frame import Frame
 from trigpointd.messages.images import (
     CALIBRATION_TYPES,
     IMAGE_TYPES,
+    check_time,
     is_rectified,
     parse_calibration,
     parse_image,
@@ -121,6 +122,7 @@ class McapSource:
         try:
             parsed = parse_image(*_type(image.channel), image.data)
             time_ns = parsed.time_ns or time_ns
+            check_time(time_ns)
             return to_frame(parsed, self._camera(calibration), time_ns, name)
         except SourceError as error:
             return BadFrame(time_ns, name, str(error))

@@ -49,7 +49,7 @@ class FeatureModel:
         path = path or packaged_model()
         session, contract = open_session(path, num_threads)
         vocabulary_path = path.with_name(contract.vocabulary)
-        vocabulary = Vocabulary.load(vocabulary_path)
+        vocabulary = Vocabulary.load(vocabulary_path, contract.descriptor_dim)
         identity = ModelIdentity(
             contract.name,
             hash_files(path, vocabulary_path),

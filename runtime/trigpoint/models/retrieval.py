@@ -37,8 +37,8 @@ class Vocabulary:
     pca: Array32
 
     @classmethod
-    def load(cls, path: Path) -> Vocabulary:
-        """Read the .npz file."""
+    def load(cls, path: Path, dim: int) -> Vocabulary:
+        """Read the .npz file, for descriptors of `dim` numbers."""
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 vocabulary = cls(
@@ -51,10 +51,11 @@ class Vocabulary:
             raise ModelError(f"no such retrieval vocabulary: {path}") from None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise ModelError(f"{path} is not a retrieval vocabulary: {error}") from error
-        num_words, dim = vocabulary.centers.shape
-        if vocabulary.mean.shape != (dim,) or vocabulary.pca.shape[1:] != (num_words * dim,):
+        shapes = (vocabulary.mean.shape, vocabulary.pca_mean.shape, vocabulary.pca.shape[1:])
+        size = vocabulary.centers.size
+        if vocabulary.centers.shape[1:] != (dim,) or shapes != ((dim,), (size,), (size,)):
             raise ModelError(
-                f"{path} is not a retrieval vocabulary: its arrays do not fit together"
+                f"{path} does not fit the network, whose descriptors have {dim} numbers"
             )
         return vocabulary
 

@@ -94,11 +94,12 @@ def _check(session: ort.InferenceSession, path: Path) -> Contract:
         contract = Contract.from_json(metadata)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
-    if outputs[DESCRIPTORS][1] != contract.descriptor_dim:
-        raise ModelError(
-            f"{path} gives descriptors of {outputs[DESCRIPTORS][1]} numbers, "
-            f"its metadata says {contract.descriptor_dim}"
-        )
+    for name, channels in ((SCORE, 1), (DESCRIPTORS, contract.descriptor_dim)):
+        if len(outputs[name]) != 4 or outputs[name][1] != channels:
+            raise ModelError(
+                f"{path} gives {name!r} of shape {outputs[name]}; "
+                f"by its metadata it is (1, {channels}, height, width)"
+            )
     return contract
 
 

@@ -1,0 +1,96 @@
+"""Of a live source the newest frame wins, whatever the localizer takes."""
+
+import asyncio
+from collections.abc import AsyncGenerator
+from pathlib import Path
+
+import numpy as np
+
+from trigpoint.database.reader import MapReader
+from trigpoint.database.writer import MapWriter
+from trigpoint.errors import SourceError
+from trigpoint.frame import Frame
+from trigpoint.localizer import Localizer
+from trigpoint.models.features import FeatureModel
+from trigpoint.rigid import Rigid3
+from trigpoint_db.demo import CAMERA
+from trigpointd.pipeline import Output, Pipeline
+from trigpointd.service import Totals, serve
+from trigpointd.sources.base import Captured
+
+
+class Burst:
+    """A live camera that gives many frames before the first can be localized, then fails."""
+
+    live = True
+
+    def __init__(self, num_frames: int, *, fails: bool = False) -> None:
+        self._num_frames = num_frames
+        self._fails = fails
+        self.closed = False
+
+    async def frames(self) -> AsyncGenerator[Captured, None]:
+        for i in range(self._num_frames):
+            yield Captured(Frame(np.zeros((480, 640), np.uint8), CAMERA, time_ns=i), i)
+        if self._fails:
+            raise SourceError("the camera is gone")
+
+    async def close(self) -> None:
+        self.closed = True
+
+
+class Collector:
+    """A sink that keeps capture times, and can fail."""
+
+    def __init__(self, *, fails: bool = False) -> None:
+        self.times_ns: list[int] = []
+        self._fails = fails
+
+    def publish(self, output: Output) -> None:
+        if self._fails:
+            raise SourceError("the disk is full")
+        self.times_ns.append(output.time_ns)
+
+    def close(self) -> None:
+        pass
+
+
+def serve_burst(
+    folder: Path, model: FeatureModel, source: Burst, *sinks: Collector
+) -> Totals | Exception:
+    with MapWriter.create(folder / "m.tpmap", model.identity):
+        pass
+    with MapReader.open(folder / "m.tpmap", model.identity) as reader:
+        pipeline = Pipeline(Localizer(model, reader), reader, Rigid3.identity(), "map")
+        try:
+            return asyncio.run(serve(source, pipeline, sinks, asyncio.Event()))
+        except SourceError as error:
+            return error
+
+
+def test_the_newest_frame_wins_and_drops_are_counted(tmp_path: Path, model: FeatureModel) -> None:
+    source, sink = Burst(50), Collector()
+    totals = serve_burst(tmp_path, model, source, sink)
+    assert isinstance(totals, Totals)
+    assert sink.times_ns[-1] == 49
+    assert sink.times_ns == sorted(sink.times_ns)
+    assert totals.num_dropped > 0
+    assert len(sink.times_ns) + totals.num_dropped == 50
+    assert source.closed
+
+
+def test_a_source_that_fails_is_reported_after_what_it_brought(
+    tmp_path: Path, model: FeatureModel
+) -> None:
+    source, sink = Burst(3, fails=True), Collector()
+    error = serve_burst(tmp_path, model, source, sink)
+    assert isinstance(error, SourceError)
+    assert str(error) == "the camera is gone"
+    assert sink.times_ns[-1] == 2
+    assert source.closed
+
+
+def test_a_sink_that_fails_does_not_stop_the_others(tmp_path: Path, model: FeatureModel) -> None:
+    failing, sink = Collector(fails=True), Collector()
+    assert isinstance(serve_burst(tmp_path, model, Burst(3), failing, sink), Totals)
+    assert sink.times_ns[-1] == 2
