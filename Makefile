@@ -3,7 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 DEMO := build/demo
-KITCHEN := ../shared/data/7scenes_redkitchen
+# Posed images to measure on, where there are any: folders with images/ and sparse/.
+DATA := ../shared/data
+KITCHEN := $(DATA)/7scenes_redkitchen
 
 .PHONY: demo test check golden bench wheel-test clean
 
@@ -29,8 +31,8 @@ test: $(READY)
 	$(BIN)/python -m pytest
 
 check: $(READY)
-	$(BIN)/ruff format --check .
-	$(BIN)/ruff check .
+	$(BIN)/ruff format --no-cache --check .
+	$(BIN)/ruff check --no-cache .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python -m pytest
