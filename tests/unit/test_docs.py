@@ -39,3 +39,9 @@ def test_every_reason_and_count_is_explained() -> None:
         assert f"`{reason}`" in text
     for field in dataclasses.fields(Statistics):
         assert f"`{field.name}`" in text
+
+
+def test_relative_links_lead_somewhere() -> None:
+    for page in [DOCS.parent / "README.md", *DOCS.rglob("*.md")]:
+        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+            assert target.startswith("https://") or (page.parent / target).exists(), (page, target)
