@@ -4,8 +4,8 @@
 
 Each set is a folder with `images/`, `sparse/` (a COLMAP model), and for each split `map*.txt`
 (names) and `queries*.txt` (names with cameras). Failures count as infinite errors. The last column
-is the share of localized queries whose true center lies inside the covariance's 95 % ellipsoid. Then
-each set's block queries are tried in the maps of all other sets: none should get a pose.
+is the share of localized queries whose true center lies inside the covariance's 95 % ellipsoid.
+Then each set's block queries are tried in the maps of all other sets: none should get a pose.
 """
 
 from __future__ import annotations

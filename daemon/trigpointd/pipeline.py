@@ -6,11 +6,10 @@ import json
 import logging
 import time
 from dataclasses import dataclass
-from typing import Any
 
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import DatabaseError
-from trigpoint.frame import Frame, Localized, Result, describe
+from trigpoint.frame import Failed, Frame, Localized, Result, describe, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.rigid import Rigid3
 from trigpointd.messages.cdr import encode_pose
@@ -18,18 +17,6 @@ from trigpointd.messages.pose import body_pose
 from trigpointd.sources.base import BadFrame, Captured
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A frame that could not be worked on: BAD_FRAME or BAD_MAP."""
-
-    reason: str
-    detail: str
-
-    def describe(self) -> dict[str, Any]:
-        """Say in JSON's types what came of the frame."""
-        return {"status": "FAILED", "reason": self.reason, "detail": self.detail}
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +28,14 @@ class Output:
     """
 
     captured: Captured
-    result: Result | Failure
+    result: Result | Failed
     pose: bytes | None
     status: bytes
 
     @property
     def outcome(self) -> str:
         """In a word, what came of the frame."""
-        return "LOCALIZED" if isinstance(self.result, Localized) else self.result.reason
+        return summarize(self.result)
 
     @property
     def time_ns(self) -> int:
@@ -83,7 +70,7 @@ class Pipeline:
         status = {
             "time_ns": frame.time_ns,
             "frame": frame.name,
-            **(result.describe() if isinstance(result, Failure) else describe(result)),
+            **describe(result),
             "latency_ms": round((time.perf_counter() - start_s) * 1e3, 3),
             "num_dropped": num_dropped,
             "map_generation": self._reader.generation,
@@ -102,10 +89,10 @@ class Pipeline:
             _log.error("%s; going on with the map as it was", problem)
         self._map_problem = problem
 
-    def _localize(self, frame: Frame | BadFrame) -> Result | Failure:
+    def _localize(self, frame: Frame | BadFrame) -> Result | Failed:
         if isinstance(frame, BadFrame):
-            return Failure("BAD_FRAME", frame.detail)
+            return Failed("BAD_FRAME", frame.detail)
         try:
             return self._localizer.localize(frame)
         except DatabaseError as error:  # a damaged image; frames elsewhere can do without it
-            return Failure("BAD_MAP", str(error))
+            return Failed("BAD_MAP", str(error))

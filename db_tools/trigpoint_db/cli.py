@@ -21,7 +21,7 @@ from rich.table import Table
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError, SourceError, TrigpointError
-from trigpoint.frame import Localized
+from trigpoint.frame import Failed, Localized, describe, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.rigid import Rigid3
@@ -115,18 +115,18 @@ def localize(
         for outcome in _localize(reader, network, wanted, images, anchors):
             outcomes.append(outcome)
             if lines is not None:
-                lines.write(json.dumps(outcome.to_json()) + "\n")
+                lines.write(json.dumps({"name": outcome.name, **describe(outcome.result)}) + "\n")
     found = {o.name: o.result.cam_from_world for o in outcomes if isinstance(o.result, Localized)}
     write_poses(poses, found)
-    counts = Counter(outcome.reason for outcome in outcomes)
+    counts = Counter(summarize(outcome.result) for outcome in outcomes)
     others = ", ".join(f"{n} {reason}" for reason, n in counts.items() if reason != "LOCALIZED")
     if as_json:
         print(json.dumps({"num_queries": len(outcomes), "outcomes": counts}))
     else:
         print(f"{len(found)} of {len(outcomes)} localized" + (f", {others}" if others else ""))
-    bad = [outcome for outcome in outcomes if outcome.result is None]
+    bad = [outcome.result for outcome in outcomes if isinstance(outcome.result, Failed)]
     if bad:
-        raise SourceError(f"{len(bad)} images could not be used, such as {bad[0].error}")
+        raise SourceError(f"{len(bad)} images could not be used, such as {bad[0].detail}")
     if not found:
         raise ConfigError(
             f"no query was localized: {others}; --results says more of each, and whether the map "

@@ -23,9 +23,11 @@ from trigpoint_db.synthetic import flight_poses, make_room, render, survey_poses
 CAMERA = Camera("OPENCV", 640, 480, (460.0, 460.0, 319.5, 239.5, -0.08, 0.02, 0.001, -0.0005))
 # The camera looks ahead from the nose of the drone: body x ahead, y left, z up; camera x right,
 # y down, z ahead.
-BODY_FROM_CAMERA = Rigid3.from_quaternion((0.5, -0.5, 0.5, -0.5), (0.12, 0.0, 0.03))
+_POSITION_M = [0.12, 0.0, 0.03]
+_ROTATION_WXYZ = [0.5, -0.5, 0.5, -0.5]
+BODY_FROM_CAMERA = Rigid3.from_quaternion(_ROTATION_WXYZ, _POSITION_M)
 
-_CONFIG = """\
+_CONFIG = f"""\
 # Settings of `trigpointd run`; docs/configuration.md describes every key.
 map = "map.tpmap"
 base_key = "trigpoint/demo"
@@ -35,8 +37,8 @@ type = "mcap"
 path = "flight.mcap"
 
 [camera] # where it sits on the body
-position_m = [0.12, 0.0, 0.03]
-rotation_wxyz = [0.5, -0.5, 0.5, -0.5]
+position_m = {_POSITION_M}
+rotation_wxyz = {_ROTATION_WXYZ}
 
 [zenoh]
 connect = ["tcp/127.0.0.1:17447"]

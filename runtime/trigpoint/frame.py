@@ -148,11 +148,26 @@ class Lost:
     detail: str = ""
 
 
+@dataclass(frozen=True)
+class Failed:
+    """No localization at all: a BAD_FRAME that cannot be read, or a BAD_MAP that was needed."""
+
+    reason: str
+    detail: str
+
+
 Result = Localized | Lost
 
 
-def describe(result: Result) -> dict[str, Any]:
+def summarize(result: Result | Failed) -> str:
+    """Say in a word what came of a frame: LOCALIZED, or the reason why not."""
+    return "LOCALIZED" if isinstance(result, Localized) else result.reason
+
+
+def describe(result: Result | Failed) -> dict[str, Any]:
     """Say in JSON's types what came of a frame."""
+    if isinstance(result, Failed):
+        return {"status": "FAILED", "reason": result.reason, "detail": result.detail}
     statistics = asdict(result.statistics)
     statistics["stage_ms"] = {k: round(v, 3) for k, v in statistics["stage_ms"].items()}
     if isinstance(result, Lost):

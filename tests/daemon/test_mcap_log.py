@@ -25,11 +25,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError, SourceError
-from trigpoint.frame import Frame
+from trigpoint.frame import Failed, Frame
 from trigpoint.rigid import Rigid3
 from trigpoint_db.recording import RecordedImage, write_recording
 from trigpointd.messages.cdr import encode_pose
-from trigpointd.pipeline import Failure, Output
+from trigpointd.pipeline import Output
 from trigpointd.sinks.mcap import McapLog
 from trigpointd.sources.base import BadFrame, Captured, Channel, Message
 from trigpointd.sources.mcap import McapSource
@@ -65,7 +65,7 @@ def play(path: Path) -> list[Captured]:
 
 
 def output(captured: Captured, status: bytes = b"{}", pose: bytes | None = None) -> Output:
-    return Output(captured, Failure("BAD_FRAME", ""), pose, status)
+    return Output(captured, Failed("BAD_FRAME", ""), pose, status)
 
 
 def write_log(path: Path, captured: list[Captured], *, frames: bool = True) -> Path:
@@ -228,14 +228,14 @@ def test_a_full_disk_ends_the_log_and_leaves_what_was_written(tmp_path: Path) ->
 
 CHILD = """
 import json, pathlib, sys
-from trigpointd.pipeline import Failure, Output
-from trigpointd.pipeline import Failure, Output
+from trigpoint.frame import Failed
+from trigpointd.pipeline import Output
 from trigpointd.sinks.mcap import McapLog
 from trigpointd.sources.base import BadFrame, Captured
 log = McapLog(pathlib.Path(sys.argv[1]), "base", frames=False)
 for i in range(22):  # of 100 kB, three to a chunk
     status = json.dumps({"i": i, "noise": "x" * 100_000}).encode()
-    log.publish(Output(Captured(BadFrame(i, "", ""), i), Failure("BAD_FRAME", ""), None, status))
+    log.publish(Output(Captured(BadFrame(i, "", ""), i), Failed("BAD_FRAME", ""), None, status))
 if sys.argv[2] == "flush":
     log.flush()
 print("written", flush=True)

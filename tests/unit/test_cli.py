@@ -149,7 +149,7 @@ def test_a_corrupt_query_does_not_cost_the_others(run: Run, place: Path) -> None
     assert "1 images could not be used" in err
     assert set(read_poses(place / "poses.txt")) == {names[0], names[2]}
     results = [json.loads(line) for line in (place / "results.jsonl").read_text().splitlines()]
-    assert results[1]["reason"] == "BAD_IMAGE"
+    assert results[1]["reason"] == "BAD_FRAME"
 
 
 def test_a_recording_needs_cameras_for_its_images(run: Run, place: Path) -> None:

@@ -27,14 +27,11 @@ class RefinedPose:
         Of (dc, dtheta) as `trigpoint.frame.Localized` defines them.
     inliers : (M,) bool
         Points within the threshold.
-    sigma : float
-        Measured standard deviation of the query's image noise, in the units of the points.
     """
 
     cam_from_world: Rigid3
     covariance: Array
     inliers: NDArray[np.bool_]
-    sigma: float
 
 
 def reprojection(
@@ -149,30 +146,21 @@ def refine_pose(
             damping *= 10
             if damping > 1e6:
                 break
-    return _with_covariance(cam_from_world, r, J, square, inliers, sigma)
+    return _with_covariance(cam_from_world, J, square, inliers)
 
 
 def _with_covariance(
-    cam_from_world: Rigid3,
-    r: Array,
-    J: Array,
-    square: Array,
-    inliers: NDArray[np.bool_],
-    sigma: float,
+    cam_from_world: Rigid3, J: Array, square: Array, inliers: NDArray[np.bool_]
 ) -> RefinedPose | None:
-    """Sandwich-free M-estimator covariance: information of the weighted points, scaled."""
-    if inliers.sum() < MIN_POINTS:
-        return None
+    """Add the covariance: inverse information of the weighted points times the residuals' scale."""
     weight = np.where(inliers, 1 / (1 + square / CAUCHY**2), 0.0)
     H = np.einsum("m,mki,mkj->ij", weight, J, J, optimize=True)
-    if not _is_determined(H):
+    if inliers.sum() < MIN_POINTS or not _is_determined(H):
         return None
     dof = max(2 * weight.sum() - 6, 0.0)
     variance = (float((weight * square).sum()) + PRIOR_DOF) / (dof + PRIOR_DOF)
     covariance = np.linalg.inv(H) * variance
-    return RefinedPose(
-        cam_from_world, (covariance + covariance.T) / 2, inliers, sigma * float(np.sqrt(variance))
-    )
+    return RefinedPose(cam_from_world, (covariance + covariance.T) / 2, inliers)
 
 
 def _is_determined(H: Array) -> bool:
