@@ -15,12 +15,10 @@ import threadpoolctl
 import typer
 
 from trigpoint.errors import TrigpointError
+from trigpoint.output import check_output, open_text
 from trigpoint.poses import format_pose
-from trigpoint.text import open_text
 from trigpointd.config import Config, LogConfig, ModelConfig, SourceConfig, ZenohConfig, load_config
 from trigpointd.service import open_pipeline, open_source, run
-from trigpointd.sinks.base import Sink
-from trigpointd.sinks.poses import PoseFile
 from trigpointd.sinks.zenoh import make_settings
 from trigpointd.watch import Received, subscribe
 
@@ -84,8 +82,7 @@ def replay(
         model=ModelConfig(path=model),
         log=None if log is None else LogConfig(path=log),
     )
-    sinks: list[Sink] = [] if poses is None else [PoseFile(poses)]
-    totals = run(config, sinks)
+    totals = run(config, poses=poses)
     print(f"{recording}: {totals}")
 
 
@@ -109,9 +106,11 @@ def watch(
         listen=tuple(listen or ()),
         multicast_scouting=not endpoints,
     )
+    check_output(poses)
     with ExitStack() as stack:
+        arriving = stack.enter_context(subscribe(config, key, exit_with_daemon=exit_with_daemon))
         file = None if poses is None else stack.enter_context(open_text(poses))
-        for received in subscribe(config, key, exit_with_daemon=exit_with_daemon):
+        for received in arriving:
             if isinstance(received, str):
                 print(f"trigpointd: {received}", file=sys.stderr)
                 continue
@@ -153,6 +152,8 @@ def main() -> None:
         app()
     except TrigpointError as error:
         sys.exit(f"trigpointd: {error}")
+    except OSError as error:  # a folder that cannot be entered, a name too long, a full disk
+        sys.exit(f"trigpointd: {error.filename or 'output'}: {error.strerror}")
     except KeyboardInterrupt:
         sys.exit(130)
 

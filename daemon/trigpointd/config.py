@@ -117,6 +117,8 @@ def _resolve(section: S, folder: Path) -> S:
     changes: dict[str, Any] = {}
     for name, value in section:
         if isinstance(value, Path):
+            if "\0" in str(value):
+                raise ConfigError(f"{name!r} names no file: {str(value)!r}")
             changes[name] = folder / value
         elif isinstance(value, Section):
             changes[name] = _resolve(value, folder)

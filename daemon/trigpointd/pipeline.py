@@ -52,6 +52,7 @@ class Pipeline:
         self._localizer = localizer
         self._reader = reader
         self._map_problem = ""
+        self._damage: set[str] = set()  # of the map, said once each
         self._body_from_camera = body_from_camera
         self._map_frame = map_frame
 
@@ -95,4 +96,7 @@ class Pipeline:
         try:
             return self._localizer.localize(frame)
         except DatabaseError as error:  # a damaged image; frames elsewhere can do without it
+            if str(error) not in self._damage:
+                self._damage.add(str(error))
+                _log.error("%s", error)
             return Failed("BAD_MAP", str(error))

@@ -11,17 +11,20 @@ from collections import Counter
 from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import TrigpointError
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
+from trigpoint.output import check_output
 from trigpointd.config import Config
 from trigpointd.latest import Latest
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.sd_notify import notify
 from trigpointd.sinks.base import Sink
 from trigpointd.sinks.mcap import McapLog
+from trigpointd.sinks.poses import PoseFile
 from trigpointd.sinks.zenoh import ZenohSink
 from trigpointd.sources.base import Captured, Source
 from trigpointd.sources.mcap import McapSource
@@ -41,23 +44,32 @@ class Totals:
         return f"{counts or 'no frames'}, {self.num_dropped} dropped"
 
 
-def run(config: Config, extra_sinks: Sequence[Sink] = ()) -> Totals:
-    """Run until the recording ends or SIGTERM or SIGINT comes; everything is closed in order."""
+def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink] = ()) -> Totals:
+    """Run until the recording ends or SIGTERM or SIGINT comes; everything is closed in order.
+
+    `poses` names a file for the poses. What is written is opened after all that is read.
+    """
+    inputs = (config.map, config.source.path)
+    check_output(poses, *inputs)
+    if config.log is not None:
+        check_output(config.log.path, *inputs)
     with ExitStack() as stack:
-        sinks = list(extra_sinks)
-        for sink in extra_sinks:
-            stack.callback(sink.close)
         pipeline = stack.enter_context(open_pipeline(config))
         source = open_source(config)
-        if config.log is not None:
-            sinks.append(McapLog.from_config(config.log, config.base_key))
-            stack.callback(sinks[-1].close)
+        sinks = list(extra_sinks)
         first = None
         if config.zenoh is not None:
             zenoh = ZenohSink(config.zenoh, config.base_key)
             stack.callback(zenoh.close)
             sinks.append(zenoh)
+            _log.info("poses go to %s/pose", config.base_key)
             first = zenoh.wait_for_subscriber(config.zenoh.wait_for_subscriber_s)
+        if poses is not None:
+            sinks.append(PoseFile(poses))
+            stack.callback(sinks[-1].close)
+        if config.log is not None:
+            sinks.append(McapLog.from_config(config.log, config.base_key))
+            stack.callback(sinks[-1].close)
         return asyncio.run(_run_until_signal(source, pipeline, sinks, first))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import zenoh
@@ -22,10 +23,11 @@ class Received:
     pose: PoseStamped
 
 
+@contextmanager
 def subscribe(
     config: ZenohConfig, key: str, *, exit_with_daemon: bool = False
-) -> Iterator[Received | str]:
-    """Yield poses as they come, and a message that is no pose as a text that says so.
+) -> Iterator[Iterator[Received | str]]:
+    """Subscribe; yields the poses as they come, and for a message that is none a text.
 
     Parameters
     ----------
@@ -52,8 +54,7 @@ def subscribe(
         session.declare_subscriber(key, inbox.put)
         if exit_with_daemon:
             session.liveliness().declare_subscriber(alive, daemon_changed, history=True)
-        while (sample := inbox.get()) is not None:
-            yield _decode(sample)
+        yield (_decode(sample) for sample in iter(inbox.get, None))
 
 
 def _decode(sample: zenoh.Sample) -> Received | str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from trigpoint.camera import Camera
 from trigpoint.database.writer import MapWriter
-from trigpoint.errors import ConfigError
+from trigpoint.errors import ConfigError, DatabaseError
 from trigpoint.frame import Frame
 from trigpoint.images import read_gray
 from trigpoint.models.features import FeatureModel
@@ -55,6 +56,7 @@ def build_map(
 ) -> int:
     """Write a new map; it appears under its name when it is complete. Returns the image count."""
     refuse_existing(path)
+    _remove_leftovers(path)
     # Under a name of its own, so that two builds at once do not meet.
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
@@ -66,11 +68,25 @@ def build_map(
             count = len(writer)
         refuse_existing(path)
         partial.rename(path)
+    except DatabaseError as error:
+        raise DatabaseError(str(error).replace(str(partial), str(path))) from error
     finally:
-        for leftover in (partial, partial.with_name(partial.name + "-lock")):
-            with contextlib.suppress(OSError):
-                leftover.unlink()
+        _remove(partial)
     return count
+
+
+def _remove(partial: Path) -> None:
+    for leftover in (partial, partial.with_name(partial.name + "-lock")):
+        with contextlib.suppress(OSError):
+            leftover.unlink()
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove what builds that were killed have left."""
+    for partial in path.parent.glob(f"{glob.escape(path.name)}.*.partial"):
+        owner = partial.name.removesuffix(".partial").rpartition(".")[2]
+        if owner.isdecimal() and not Path("/proc", owner).exists():
+            _remove(partial)
 
 
 def refuse_existing(path: Path) -> None:

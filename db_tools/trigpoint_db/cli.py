@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import time
 from collections import Counter
@@ -24,11 +25,11 @@ from trigpoint.errors import ConfigError, SourceError, TrigpointError
 from trigpoint.frame import Failed, Localized, describe, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
+from trigpoint.output import check_output, open_text
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import LocalizerOptions
-from trigpoint.text import open_text
 from trigpoint_db.build import append_map, build_map, check_files, select_images
-from trigpoint_db.demo import make_demo
+from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
@@ -77,6 +78,9 @@ def build(
     posed = read_model(colmap)
     if list_ is not None:
         posed = select_images(posed, read_names(list_))
+    if not posed:
+        raise ConfigError(f"there are no images to map: {list_ or colmap} names none")
+    check_output(map_)
     check_files((image.name for image in posed), images)
     write = append_map if append else build_map
     network = FeatureModel.load(model)
@@ -102,6 +106,8 @@ def localize(
     as_json: Json = False,
 ) -> None:
     """Localize images; OK poses go to a file, what came of every query to another."""
+    for output in (poses, results):
+        check_output(output, map_, queries)
     wanted = read_queries(queries)
     if not wanted:
         raise ConfigError(f"{queries} names no images")
@@ -126,7 +132,7 @@ def localize(
         print(f"{len(found)} of {len(outcomes)} localized" + (f", {others}" if others else ""))
     bad = [outcome.result for outcome in outcomes if isinstance(outcome.result, Failed)]
     if bad:
-        raise SourceError(f"{len(bad)} images could not be used, such as {bad[0].detail}")
+        raise SourceError(f"{len(bad)} queries failed; the first: {bad[0].detail}")
     if not found:
         raise ConfigError(
             f"no query was localized: {others}; --results says more of each, and whether the map "
@@ -154,6 +160,7 @@ def evaluate_command(
     as_json: Json = False,
 ) -> None:
     """Compare poses with the truth; a query without a pose counts as a failure."""
+    check_output(picture, poses, *(p for p in (truth, queries, log) if p is not None))
     estimates, reference = read_poses(poses), read_truth(truth)
     names = list(reference) if queries is None else read_names(queries)
     evaluation = evaluate(estimates, reference, names)
@@ -169,7 +176,8 @@ def evaluate_command(
             print_latency(console, stage_times)
     if picture is not None:
         plot_paths(estimates, {name: reference[name] for name in names}, picture)
-        console.print(f"picture: {picture}", soft_wrap=True)
+        if not as_json:
+            console.print(f"picture: {picture}", soft_wrap=True)
 
 
 def read_truth(path: Path) -> dict[str, Rigid3]:
@@ -230,7 +238,7 @@ def record(
     queries: Annotated[
         Path | None, typer.Option(help="Only these, `name MODEL width height params...`.")
     ] = None,
-    rate: Annotated[float, typer.Option(help="Images a second.", min=0.01)] = 10.0,
+    rate: Annotated[float, typer.Option(help="Images a second.", min=0.01, max=1e4)] = 10.0,
     truth: Annotated[Path | None, typer.Option(help="A COLMAP model's folder.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -244,6 +252,8 @@ def record(
         common = Camera.from_text(camera or "")
         wanted = [Query(name, common) for name in _image_names(images)]
     poses = {} if truth is None else read_truth(truth)
+    if truth is not None and not any(query.name in poses for query in wanted):
+        raise ConfigError(f"{truth} has no pose of any of the images")
     recorded = [RecordedImage(images / q.name, q.camera, poses.get(q.name)) for q in wanted]
     count = write_recording(out, track(recorded, "recording", len(recorded)), rate_hz=rate)
     if as_json:
@@ -266,13 +276,13 @@ def demo(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to; made if missing.")],
     survey: Annotated[int, typer.Option(help="Images of the map.", min=10)] = 140,
     flight: Annotated[int, typer.Option(help="Frames of the flight.", min=2)] = 120,
-    seed: Annotated[int, typer.Option(help="Another seed, another room.")] = 0,
+    seed: Annotated[int, typer.Option(help="Another seed, another room.", min=0)] = 0,
     as_json: Json = False,
 ) -> None:
     """Render a room, survey and fly through it: images, map, recording, truth, settings."""
+    prepare_folder(folder)
     posed = make_demo(folder, num_survey=survey, num_flight=flight, seed=seed, progress=track)
     map_ = folder / "map.tpmap"
-    map_.unlink(missing_ok=True)
     network = FeatureModel.load()
     build_map(map_, track(posed, "mapping", len(posed)), folder / "survey", network)
     if as_json:
@@ -283,10 +293,14 @@ def demo(
 
 def main() -> None:
     """Run the command; an error is one line and exit code 1."""
+    # So that what is half done is cleaned up.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         app()
     except TrigpointError as error:
         sys.exit(f"trigpoint-db: {error}")
+    except OSError as error:  # a folder that cannot be entered, a name too long, a full disk
+        sys.exit(f"trigpoint-db: {error.filename or 'output'}: {error.strerror}")
     except KeyboardInterrupt:
         sys.exit(130)
 

@@ -51,14 +51,21 @@ overwrite = true
 """
 
 
+def prepare_folder(folder: Path) -> None:
+    """Make the folder, or clear the files of a demo before; a folder of anything else is kept."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "trigpointd.toml").is_file():
+        raise ConfigError(f"{folder} is not empty and holds no demo; name another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("map.tpmap", "flight.mcap"):
+        (folder / name).unlink(missing_ok=True)
+    (folder / "trigpointd.toml").write_text(_CONFIG)
+
+
 def render_images(
     room_seed: int, cams_from_world: Rigid3, folder: Path, *, noise_seed: int, num_jobs: int = 2
 ) -> Iterator[PosedImage]:
     """Render one JPEG a pose into a folder, yielding each as it is done, in order."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot make the folder {folder}: {error.strerror}") from error
+    folder.mkdir(parents=True, exist_ok=True)
     poses = [cams_from_world[i] for i in range(len(cams_from_world))]
     work = partial(_render_one, room_seed, folder, noise_seed)
     # OpenCV's threads do not survive a fork.
@@ -124,5 +131,4 @@ def make_demo(
     (folder / "truth.txt").write_text("".join(lines))
     queries = [f"{image.name} {image.camera.to_text()}\n" for image in flight]
     (folder / "queries.txt").write_text("".join(queries))
-    (folder / "trigpointd.toml").write_text(_CONFIG)
     return survey

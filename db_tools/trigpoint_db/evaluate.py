@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 
 # The paper's accuracy levels (its table of Aachen and RobotCar Seasons): metres, degrees.
 THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
+PICTURES = (".png", ".svg", ".pdf")
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,12 +209,12 @@ def plot_paths(estimates: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], out
     figure.colorbar(
         points, ax=(above, side), label="position error (m)", extend="max", aspect=40, shrink=0.9
     )
+    if out.suffix.lower() not in PICTURES:
+        raise ConfigError(f"cannot draw {out}; name it {' or '.join(PICTURES)}")
     try:
         figure.savefig(out)
     except OSError as error:
         raise ConfigError(f"cannot write {out}: {error.strerror}") from error
-    except ValueError as error:  # no format goes by this suffix
-        raise ConfigError(f"cannot write {out}: {error}") from error
 
 
 def _draw_view(

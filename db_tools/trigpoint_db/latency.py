@@ -22,7 +22,15 @@ from trigpoint.errors import ConfigError
 TOTAL = "total"
 
 # What reading bytes that are cut off or damaged raises.
-_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, MemoryError)
+_DAMAGE = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    RuntimeError,
+    MemoryError,
+    OverflowError,
+)
 
 
 def read_stage_times(log: Path) -> dict[str, list[float]]:

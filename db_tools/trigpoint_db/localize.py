@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from trigpoint.errors import TrigpointError
+from trigpoint.errors import ConfigError, DatabaseError, SourceError
 from trigpoint.frame import Failed, Result
 from trigpoint.localizer import Localizer
 from trigpoint_db.build import read_frame
@@ -28,7 +28,9 @@ def localize_images(
     for query in queries:
         try:
             frame = read_frame(folder / query.name, query.camera, query.name)
-        except TrigpointError as error:
-            yield Outcome(query.name, Failed("BAD_FRAME", str(error)))
-            continue
-        yield Outcome(query.name, localizer.localize(frame))
+            result: Result | Failed = localizer.localize(frame)
+        except (ConfigError, SourceError) as error:
+            result = Failed("BAD_FRAME", str(error))
+        except DatabaseError as error:
+            result = Failed("BAD_MAP", str(error))
+        yield Outcome(query.name, result)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
+from trigpoint.output import check_output
 from trigpoint.poses import format_pose
 from trigpoint.rigid import Rigid3
 
@@ -122,6 +123,8 @@ def read_lines(path: Path) -> Iterator[tuple[str, str]]:
 
 def write_atomically(path: Path, text: str) -> None:
     """Write a text file that appears under its name once it is whole."""
+    check_output(path)
+    path = path.resolve()  # through a link, to what it names
     partial = path.with_name(path.name + ".partial")
     try:
         try:

@@ -17,6 +17,7 @@ from mcap_protobuf.writer import Writer
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
+from trigpoint.output import check_output
 from trigpoint.rigid import Rigid3
 
 IMAGE_TOPIC = "/camera/image"
@@ -53,6 +54,9 @@ def write_recording(
     """
     if not rate_hz > 0:
         raise ConfigError(f"a recording at {rate_hz} images a second is not possible")
+    check_output(out)
+    if out.exists():
+        raise ConfigError(f"{out} exists; remove it first, or name another file")
     partial = out.with_name(out.name + ".partial")
     try:
         try:
@@ -67,7 +71,9 @@ def write_recording(
         finally:
             partial.unlink(missing_ok=True)
     except OSError as error:
-        raise ConfigError(f"cannot write the recording {out}: {error}") from error
+        raise ConfigError(
+            f"cannot make the recording {out}: {error.filename or out}: {error.strerror}"
+        ) from error
     return count
 
 

@@ -32,6 +32,7 @@ PARAMETERS: dict[str, tuple[str, ...]] = {
 # hundred where a strong lens is nearly flat, at the corners of a 115 degree image.
 _UNDISTORT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 400, 1e-12)
 _MAX_ROUND_TRIP_ERROR_PX = 1e-3
+MAX_SIDE_PX = 65_535
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Camera:
                 f"camera parameters {self.params} are not usable: they must be finite and the "
                 "focal length positive"
             )
-        if self.width < 1 or self.height < 1:
+        if not (1 <= self.width <= MAX_SIDE_PX and 1 <= self.height <= MAX_SIDE_PX):
             raise ConfigError(f"camera size {self.width} x {self.height} is not usable")
 
     @classmethod

@@ -66,8 +66,8 @@ class LocalizerOptions:
         if self.num_anchors < 2:
             raise ConfigError("num_anchors must be at least 2: one anchor does not tell the scale")
         for name, value in vars(self).items():
-            if isinstance(value, int | float) and value <= 0:
-                raise ConfigError(f"{name} must be positive, not {value}")
+            if isinstance(value, int | float) and not 1e-6 < value < 1e6:
+                raise ConfigError(f"{name} must be positive and below a million, not {value}")
         if self.min_inlier_ratio > 1:
             raise ConfigError(f"min_inlier_ratio must be at most 1, not {self.min_inlier_ratio}")
 

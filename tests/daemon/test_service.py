@@ -309,3 +309,22 @@ def test_without_poselib_opencv_does_its_part(demo: Demo, tmp_path: Path) -> Non
         for time_ns, pose in found.items()
     ]
     assert np.median(errors_m) < 0.01
+
+
+def test_a_failed_start_costs_no_file(demo: Demo, tmp_path: Path) -> None:
+    poses = tmp_path / "poses.txt"
+    poses.write_text("precious")
+    done = run("trigpointd", "replay", demo.recording, "--map", tmp_path / "no", "--poses", poses)
+    assert done.returncode == 1
+    assert poses.read_text() == "precious"
+    recording = tmp_path / "copy.mcap"
+    recording.write_bytes(demo.recording.read_bytes())
+    done = run("trigpointd", "replay", recording, "--map", demo.map, "--poses", recording)
+    assert done.returncode == 1
+    assert "it is an input" in done.stderr
+    config = write_config(tmp_path, demo.map, recording)
+    config.write_text(config.read_text().replace('"log.mcap"', f'"{recording}"\noverwrite = true'))
+    done = run("trigpointd", "run", "--config", config)
+    assert done.returncode == 1
+    assert "it is an input" in done.stderr
+    assert recording.read_bytes() == demo.recording.read_bytes()

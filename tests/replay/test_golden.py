@@ -39,7 +39,7 @@ class Collector:
 def test_the_flight_gives_the_golden_poses(demo: Demo, request: pytest.FixtureRequest) -> None:
     collector = Collector()
     source = SourceConfig(type="mcap", path=demo.recording)
-    totals = run(Config(map=demo.map, source=source), [collector])
+    totals = run(Config(map=demo.map, source=source), extra_sinks=[collector])
     assert totals.num_dropped == 0
     poses = {
         str(output.time_ns): output.result.cam_from_world

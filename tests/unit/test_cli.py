@@ -1,8 +1,11 @@
 """`trigpoint-db` as its users meet it: what it prints, and what it says of bad input."""
 
 import json
+import os
 import shutil
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -146,7 +149,7 @@ def test_a_corrupt_query_does_not_cost_the_others(run: Run, place: Path) -> None
         "--results", place / "results.jsonl",
     )  # fmt: skip
     assert code == 1
-    assert "1 images could not be used" in err
+    assert "1 queries failed" in err
     assert set(read_poses(place / "poses.txt")) == {names[0], names[2]}
     results = [json.loads(line) for line in (place / "results.jsonl").read_text().splitlines()]
     assert results[1]["reason"] == "BAD_FRAME"
@@ -161,3 +164,80 @@ def test_a_recording_needs_cameras_for_its_images(run: Run, place: Path) -> None
     assert code == 1
     assert "'THIN_PRISM' is not known" in err
     assert not out.exists()
+
+
+def test_what_a_killed_build_left_is_removed_by_the_next(run: Run, place: Path) -> None:
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    leftover = place / f"m.tpmap.{ended.pid}.partial"
+    leftover.write_bytes(b"half a map")
+    of_another_build = place / f"m.tpmap.{os.getppid()}.partial"
+    of_another_build.write_bytes(b"half a map")
+    assert run(*build(place))[0] == 0
+    assert not leftover.exists()
+    assert of_another_build.exists()
+
+
+def test_sigterm_leaves_nothing_half_built(place: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "trigpoint_db.cli", *map(str, build(place))],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    while process.poll() is None and not list(place.glob("m.tpmap.*.partial")):
+        time.sleep(0.01)
+    process.terminate()
+    process.wait(20)
+    assert not list(place.glob("m.tpmap.*"))
+
+
+def test_an_empty_list_makes_no_map(run: Run, place: Path) -> None:
+    (place / "none.txt").write_text("# nothing\n")
+    code, _, err = run(*build(place, "m.tpmap", "--list", place / "none.txt"))
+    assert code == 1
+    assert "no images to map" in err
+
+
+def test_inputs_and_devices_are_not_written_over(run: Run, place: Path) -> None:
+    assert run(*build(place))[0] == 0
+    asked = ["localize", place / "m.tpmap", "--images", place / "images"]
+    asked += ["--queries", place / "queries.txt", "--poses"]
+    before = (place / "queries.txt").read_bytes()
+    for output, said in (
+        (place / "queries.txt", "it is an input"),
+        (place / "m.tpmap", "it is an input"),
+        (Path("/dev/null"), "not a regular file"),
+        (place / "nowhere" / "poses.txt", "there is no folder"),
+    ):
+        code, _, err = run(*asked, output)
+        assert code == 1
+        assert said in err
+    assert (place / "queries.txt").read_bytes() == before
+    assert Path("/dev/null").is_char_device()
+    assert run("verify", place / "m.tpmap")[0] == 0
+
+
+def test_a_recording_is_not_overwritten(run: Run, place: Path) -> None:
+    asked = ["record", place / "r.mcap", "--images", place / "images"]
+    asked += ["--queries", place / "queries.txt"]
+    assert run(*asked)[0] == 0
+    before = (place / "r.mcap").read_bytes()
+    code, _, err = run(*asked)
+    assert code == 1
+    assert "exists" in err
+    assert (place / "r.mcap").read_bytes() == before
+
+
+def test_the_demo_keeps_a_folder_of_other_things(run: Run, place: Path) -> None:
+    code, _, err = run("demo", place)
+    assert code == 1
+    assert "holds no demo" in err
+
+
+def test_nothing_is_sent_home(demo: Demo, tmp_path: Path) -> None:
+    """onnxruntime collects usage data unless it is told not to before it is imported."""
+    done = subprocess.run(
+        [sys.executable, "-m", "trigpoint_db.cli", "info", str(demo.map)],
+        env={**os.environ, "HOME": str(tmp_path)}, capture_output=True, check=True,
+    )  # fmt: skip
+    assert done.stderr == b""
+    assert list(tmp_path.iterdir()) == []

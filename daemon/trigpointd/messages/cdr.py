@@ -79,6 +79,8 @@ def decode_pose(data: bytes) -> PoseStamped:
     time_ns, frame_id = reader.header()
     x, y, z, qx, qy, qz, qw = reader.numbers("d", 7)
     covariance = np.reshape(reader.numbers("d", 36), (6, 6))
+    if not np.isfinite([x, y, z]).all():
+        raise SourceError(f"a pose message's position ({x}, {y}, {z}) is no place")
     if not 0.5 < qx * qx + qy * qy + qz * qz + qw * qw < 2.0:
         raise SourceError(f"a pose message's quaternion ({qx}, {qy}, {qz}, {qw}) is no rotation")
     pose = Rigid3.from_quaternion((qw, qx, qy, qz), (x, y, z))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from trigpoint.errors import SourceError
 from trigpoint.frame import Localized
+from trigpoint.output import open_text
 from trigpoint.poses import format_pose
-from trigpoint.text import open_text
 from trigpointd.pipeline import Output
 
 

@@ -40,6 +40,7 @@ _DAMAGE = (
     LookupError,
     RuntimeError,
     MemoryError,
+    OverflowError,
     OSError,
 )
 
@@ -177,14 +178,14 @@ class _Recording:
 
     def messages(self, topics: Collection[str] | None) -> Iterator[Message]:
         """Yield messages in the order of their log times, without an index in that of the file."""
-        if self._indexed:
-            found = self._seeking_reader().iter_messages(topics)
-        else:
-            self._stream.seek(0)
-            reader = NonSeekingReader(self._stream, validate_crcs=True)
-            found = reader.iter_messages(topics, log_time_order=False)
         channels: dict[int, Channel] = {}
         try:
+            if self._indexed:
+                found = self._seeking_reader().iter_messages(topics)
+            else:
+                self._stream.seek(0)
+                reader = NonSeekingReader(self._stream, validate_crcs=True)
+                found = reader.iter_messages(topics, log_time_order=False)
             for schema, channel, message in found:
                 if channel.id not in channels:
                     channels[channel.id] = _channel(channel, schema)

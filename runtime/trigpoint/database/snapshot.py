@@ -19,6 +19,7 @@ from trigpoint.errors import DatabaseError
 from trigpoint.frame import ModelIdentity
 
 MAX_MAP_BYTES = 2**37  # of address space, not of disk; arm64 kernels may offer no more than 2**39
+LOCK_BYTES = 16_384  # more than the lock file of LMDB's 126 readers needs
 
 # LMDB wants one environment for a file in a process: readers and a writer share it.
 _environments: WeakValueDictionary[tuple[int, Path, int, int], lmdb.Environment]
@@ -41,18 +42,34 @@ def share_environment(path: Path, fd: int) -> lmdb.Environment:
 
 def _open_environment(path: Path) -> lmdb.Environment:
     open_ = partial(
-        lmdb.open, str(path), map_size=MAX_MAP_BYTES, subdir=False, mode=0o644, lib_version=0
+        lmdb.open,
+        os.fsencode(path),
+        map_size=MAX_MAP_BYTES,
+        subdir=False,
+        mode=0o644,
+        lib_version=0,
     )
     try:
+        _reserve_lock(path)
         # A reader too opens for writing where it may, so that a writer can join it in this process.
         environment = open_(readonly=not os.access(path, os.W_OK))
-    except lmdb.Error as error:
-        if error.code not in (errno.EACCES, errno.EROFS):
+    except (lmdb.Error, OSError) as error:
+        code = error.code if isinstance(error, lmdb.Error) else error.errno
+        if code not in (errno.EACCES, errno.EROFS, errno.ENOSPC, errno.EDQUOT):
             raise
         # No lock file can be made here: read without one, and see `Snapshot.require_kept`.
         return open_(readonly=True, lock=False)
     environment.reader_check()  # frees what readers that died still hold
     return environment
+
+
+def _reserve_lock(path: Path) -> None:
+    """Give the lock file its space: LMDB writes it through a mapping, fatally on a full disk."""
+    fd = os.open(path.with_name(path.name + "-lock"), os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        os.posix_fallocate(fd, 0, LOCK_BYTES)
+    finally:
+        os.close(fd)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from trigpoint.errors import ModelError
 from trigpoint.frame import LocalFeatures, ModelIdentity
 from trigpoint.models.retrieval import Vocabulary
 from trigpoint.models.session import (
@@ -61,9 +62,13 @@ class FeatureModel:
     def extract(self, image: NDArray[np.uint8], max_keypoints: int = 1024) -> LocalFeatures:
         """Extract at most `max_keypoints` features of a gray image (H, W), best score first."""
         small = _fit(image, self.contract)
-        score, desc = self.session.run(
-            [SCORE, DESCRIPTORS], {INPUT: _standardize(small, self.contract)[None, None]}
-        )
+        try:
+            score, desc = self.session.run(
+                [SCORE, DESCRIPTORS], {INPUT: _standardize(small, self.contract)[None, None]}
+            )
+        except Exception as error:  # onnxruntime's errors share no narrower base
+            reason = str(error).splitlines()[0]
+            raise ModelError(f"the network {self.contract.name!r} cannot run: {reason}") from error
         points, scores = select_keypoints(score[0, 0], max_keypoints, self.contract.min_score)
         dim, rows, columns = desc.shape[1:]
         dense = np.ascontiguousarray(desc[0].reshape(dim, -1).T)

@@ -53,7 +53,11 @@ class Vocabulary:
             raise ModelError(f"{path} is not a retrieval vocabulary: {error}") from error
         shapes = (vocabulary.mean.shape, vocabulary.pca_mean.shape, vocabulary.pca.shape[1:])
         size = vocabulary.centers.size
-        if vocabulary.centers.shape[1:] != (dim,) or shapes != ((dim,), (size,), (size,)):
+        if (
+            not len(vocabulary.pca)
+            or vocabulary.centers.shape[1:] != (dim,)
+            or shapes != ((dim,), (size,), (size,))
+        ):
             raise ModelError(
                 f"{path} does not fit the network, whose descriptors have {dim} numbers"
             )

@@ -39,12 +39,19 @@ class Contract:
     vocabulary: str  # file name of the retrieval vocabulary beside the network
 
     def __post_init__(self) -> None:
+        texts = (self.name, self.vocabulary)
+        counts = (self.descriptor_dim, self.multiple_of, self.long_side_px)
+        if not (
+            all(isinstance(text, str) and text for text in texts)
+            and all(isinstance(count, int) and 1 <= count <= 65_536 for count in counts)
+            and isinstance(self.min_score, int | float)
+            and Path(self.vocabulary).name == self.vocabulary
+        ):
+            raise ModelError(f"the contract {self} is not one that docs/models.md describes")
         if self.normalization not in ("standardize", "unit"):
             raise ModelError(
                 f"normalization {self.normalization!r} is not known; use 'standardize' or 'unit'"
             )
-        if min(self.descriptor_dim, self.multiple_of, self.long_side_px) < 1:
-            raise ModelError("descriptor_dim, multiple_of and long_side_px must be positive")
 
     def to_json(self) -> str:
         """Write the metadata property."""
