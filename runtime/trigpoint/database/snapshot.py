@@ -55,7 +55,8 @@ def _open_environment(path: Path) -> lmdb.Environment:
         environment = open_(readonly=not os.access(path, os.W_OK))
     except (lmdb.Error, OSError) as error:
         code = error.code if isinstance(error, lmdb.Error) else error.errno
-        if code not in (errno.EACCES, errno.EROFS, errno.ENOSPC, errno.EDQUOT):
+        no_room = (errno.EACCES, errno.EROFS, errno.ENOSPC, errno.EDQUOT)
+        if code not in no_room or path.stat().st_size == 0:  # empty: about to be written
             raise
         # No lock file can be made here: read without one, and see `Snapshot.require_kept`.
         return open_(readonly=True, lock=False)

@@ -39,10 +39,8 @@ class MapWriter:
         self._num_images = metadata.num_images
         self._scales: list[np.float32] = []  # of the last retrieval block, unless it is full
         self._rows: list[NDArray[np.int8]] = []
-        self._environment: lmdb.Environment | None = share_environment(path, fd)
+        self._environment: lmdb.Environment | None = _writable_environment(path, fd)
         self._txn: lmdb.Transaction | None = None
-        if self._environment.flags()["readonly"]:
-            raise DatabaseError("cannot be written: no lock file can be made beside it")
 
     @classmethod
     def create(cls, path: Path, model: ModelIdentity) -> Self:
@@ -58,7 +56,7 @@ class MapWriter:
             undo.callback(os.close, fd)
             _lock(fd)
             metadata = schema.Metadata(model)
-            environment = share_environment(path, fd)
+            environment = _writable_environment(path, fd)
             with environment.begin(write=True) as txn:
                 _put(txn, schema.METADATA_KEY, metadata.encode())
             writer = cls(path, fd, metadata)
@@ -153,8 +151,8 @@ class MapWriter:
             except lmdb.Error as error:
                 self.close()
                 raise DatabaseError(
-                    f"cannot be written: {error.reason}; what was committed is kept, "
-                    "so free disk space if that is it, and add the rest again"
+                    f"cannot be written: {error.reason}; is the disk full? The map is as it was "
+                    "at the last commit"
                 ) from error
 
     def _put_last_block(self, txn: lmdb.Transaction) -> None:
@@ -171,6 +169,16 @@ class MapWriter:
 
 def _put(txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
     txn.put(key, schema.seal(key, payload))
+
+
+def _writable_environment(path: Path, fd: int) -> lmdb.Environment:
+    environment = share_environment(path, fd)
+    if environment.flags()["readonly"]:
+        raise DatabaseError(
+            "cannot be written: no lock file can be made beside it; is the disk full, or the "
+            "folder read-only?"
+        )
+    return environment
 
 
 def _lock(fd: int) -> None:
