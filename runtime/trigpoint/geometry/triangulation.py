@@ -132,7 +132,7 @@ def project_tracks(
 
 
 def triangulate(
-    views_from_world: Rigid3, tracks: Tracks, *, num_iterations: int = 5
+    views_from_world: Rigid3, tracks: Tracks, *, num_iterations: int = 3
 ) -> tuple[Array, Array]:
     """Triangulate every point from all its observations.
 
