@@ -130,7 +130,7 @@ def test_one_anchor_is_too_few(
 def test_an_uncertain_position_is_refused_where_a_limit_is_set(
     model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
 ) -> None:
-    options = LocalizerOptions(max_position_std_m=1e-6)
+    options = LocalizerOptions(max_position_std_m=1e-5)
     result = Localizer(model, reader, options).localize(flight[0][0])
     assert reason(result) is Reason.HIGH_UNCERTAINTY
 
