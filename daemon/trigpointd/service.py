@@ -8,9 +8,10 @@ import logging
 import signal
 import time
 from collections import Counter
-from collections.abc import Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from trigpoint.database.reader import MapReader
@@ -63,7 +64,7 @@ def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink
             stack.callback(zenoh.close)
             sinks.append(zenoh)
             _log.info("poses go to %s/pose", config.base_key)
-            first = zenoh.wait_for_subscriber(config.zenoh.wait_for_subscriber_s)
+            first = partial(zenoh.wait_for_subscriber, config.zenoh.wait_for_subscriber_s)
         if poses is not None:
             sinks.append(PoseFile(poses))
             stack.callback(sinks[-1].close)
@@ -92,7 +93,7 @@ async def _run_until_signal(
     source: Source,
     pipeline: Pipeline,
     sinks: Sequence[Sink],
-    first: Coroutine[None, None, None] | None,
+    first: Callable[[], Coroutine[None, None, None]] | None,
 ) -> Totals:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -102,7 +103,7 @@ async def _run_until_signal(
     _log.info("localizing")
     try:
         if first is not None:
-            await _unless(stop, first)
+            await _unless(stop, first())
         return await serve(source, pipeline, sinks, stop)
     finally:
         notify("STOPPING=1")

@@ -283,6 +283,17 @@ def test_a_port_in_use_is_one_line_and_exit_1(demo: Demo, tmp_path: Path, port: 
     assert done.stderr.count("\n") == 1
 
 
+def test_a_log_that_exists_is_one_line_and_exit_1(demo: Demo, tmp_path: Path, port: int) -> None:
+    config = write_config(tmp_path, demo.map, demo.recording, port=port)
+    (tmp_path / "log.mcap").write_text("precious")
+    done = run("trigpointd", "run", "--config", config)
+    assert done.returncode == 1
+    errors = [line for line in done.stderr.splitlines() if "poses go to" not in line]
+    assert len(errors) == 1
+    assert "log.mcap exists" in errors[0]
+    assert (tmp_path / "log.mcap").read_text() == "precious"
+
+
 def test_check_config_opens_what_is_named(demo: Demo, tmp_path: Path) -> None:
     config = write_config(tmp_path, demo.map, demo.recording)
     assert run("trigpointd", "check-config", config).returncode == 0
