@@ -1,0 +1,1 @@
+"""How the packaged networks are made. Needs the extra `train`; no package imports it."""
