@@ -6,8 +6,10 @@ DEMO := build/demo
 # Posed images to measure on, where there are any: folders with images/ and sparse/.
 DATA := ../shared/data
 KITCHEN := $(DATA)/7scenes_redkitchen
+# Everyday pictures without poses, a tenth of which no training sees.
+PHOTOGRAPHS := ../shared/train_images/images
 
-.PHONY: demo test check golden bench wheel-test clean
+.PHONY: demo test check golden bench bench-models wheel-test clean
 
 # uv where it is installed, else venv and pip.
 $(READY): pyproject.toml
@@ -54,6 +56,15 @@ bench: $(READY)
 	  $(BIN)/python benchmarks/stage_times.py $(DEMO)/map.tpmap \
 	    --images $(DEMO)/flight --queries $(DEMO)/queries.txt; \
 	fi
+
+# Our networks beside RootSIFT and, where its checkout is named, EdgePoint2, which needs torch:
+# make bench-models EDGEPOINT2=../EdgePoint2 FP32=build/fp32
+bench-models: $(READY)
+	@mkdir -p build/bench
+	$(BIN)/python -m benchmarks.models $(DATA) \
+	  $(if $(wildcard $(PHOTOGRAPHS)),--photographs $(PHOTOGRAPHS)) \
+	  $(if $(EDGEPOINT2),--edgepoint2 '$(EDGEPOINT2)') $(if $(FP32),--fp32 '$(FP32)') \
+	  --output build/bench/models.md --json build/bench/models.json
 
 # The suite against the installed wheel, not the checkout.
 wheel-test: $(READY)

@@ -1,6 +1,6 @@
 """Localization error on posed images, for every set and split in a folder.
 
-    python benchmarks/accuracy.py ../shared/data [--anchors 20]
+    python benchmarks/accuracy.py ../shared/data [--anchors 20] [--model base]
 
 Each set is a folder with `images/`, `sparse/` (a COLMAP model), and for each split `map*.txt`
 (names) and `queries*.txt` (names with cameras). Failures count as infinite errors. The last column
@@ -87,9 +87,10 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("data", type=Path)
     parser.add_argument("--anchors", type=int, default=20)
+    parser.add_argument("--model", default="base", help="tiny, base, or a file")
     arguments = parser.parse_args()
     threadpoolctl.threadpool_limits(1, user_api="blas")
-    network = FeatureModel.load()
+    network = FeatureModel.load(arguments.model)
     print("| set | localized | median | 90th percentile | median (deg) | in 95 % |")
     print("|---|---|---|---|---|---|")
     folders = sorted(path for path in arguments.data.iterdir() if path.is_dir())

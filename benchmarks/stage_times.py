@@ -47,9 +47,10 @@ def main() -> None:
     parser.add_argument("map", type=Path)
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--queries", type=Path, required=True)
+    parser.add_argument("--model", default="base", help="tiny, base, or a file")
     arguments = parser.parse_args()
     threadpoolctl.threadpool_limits(1, user_api="blas")
-    network = FeatureModel.load()
+    network = FeatureModel.load(arguments.model)
     frames = [
         read_frame(arguments.images / query.name, query.camera, query.name)
         for query in read_queries(arguments.queries)

@@ -28,7 +28,7 @@ class Profile:
 
 
 PROFILES = {
-    "tiny": Profile((16, 16, 32, 64, 64), (0, 0, 1, 1, 1), 64, 16, 8),
+    "tiny": Profile((16, 16, 32, 64, 64), (0, 0, 1, 1, 1), 48, 16, 8),
     "base": Profile((16, 32, 64, 128, 128), (0, 1, 2, 2, 1), 80, 32),
     "large": Profile((24, 48, 96, 160, 192), (0, 2, 3, 3, 2), 160, 48),
 }
@@ -97,6 +97,11 @@ class Network(nn.Module):
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Return logits (B, 1, H, W) and descriptors (B, 64, H/s, W/s)."""
+        score, fused = self.look(image)
+        return score, self.desc(fused)
+
+    def look(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Return logits, and what the descriptors are made of, (B, fusion, H/8, W/8)."""
         x4 = self.scales[1](self.scales[0](image))
         x8 = self.scales[2](x4)
         x16 = self.scales[3](x8)
@@ -105,7 +110,15 @@ class Network(nn.Module):
             self.fuse4(x4) + self.fuse8(x8) + _double(self.fuse16(x16) + _double(self.fuse32(x32)))
         )
         detected = self.detected(self.detect4(x4) + _double(self.detect8(fused)))
-        return F.pixel_shuffle(self.score(detected), 4), self.desc(fused)
+        return F.pixel_shuffle(self.score(detected), 4), fused
+
+    def mean_desc(self) -> nn.Conv2d:
+        """Make the layer from `fused` to the mean of the descriptors of each cell of stride 8."""
+        weight = self.desc.weight.detach().mean(dim=(2, 3)).T
+        layer = nn.Conv2d(*weight.shape[::-1], 1)
+        layer.weight.data = weight[:, :, None, None].contiguous()
+        layer.bias.data = self.desc.bias.detach().clone()
+        return layer
 
 
 def _double(x: Tensor) -> Tensor:

@@ -22,37 +22,38 @@ from training.standardize import standardize
 
 NUM_WORDS = 32
 GLOBAL_DIM = 256
-STRIDE = 8  # of the descriptors that are summed
 VIEW = (384, 288)  # width, height of the pictures learnt from
-VIEWS_OF_FLAT = 4
+VIEWS_OF_FLAT = 2
 SHRINKAGE = 0.2  # of the covariance within a place towards a sphere
 
 
 class GlobalHead(nn.Module):
     """NetVLAD (Arandjelovic et al., CVPR 2016): soft assignment, intra-normalisation, whitening.
 
-    Takes dense descriptors (B, 64, h, w), gives unit vectors (B, GLOBAL_DIM).
+    Takes what the descriptors are made of (B, fusion, h, w), gives unit vectors (B, GLOBAL_DIM).
     """
 
-    def __init__(self, pool: int) -> None:
+    def __init__(self, network: Network) -> None:
         super().__init__()
-        self.pool = pool
-        self.assign = nn.Conv2d(DESCRIPTOR_DIM, NUM_WORDS, 1)
+        self.desc = network.mean_desc()
+        self.assign = nn.Linear(DESCRIPTOR_DIM, NUM_WORDS)
         self.words = nn.Parameter(torch.zeros(NUM_WORDS, DESCRIPTOR_DIM))
         self.whiten = nn.Linear(NUM_WORDS * DESCRIPTOR_DIM, GLOBAL_DIM)
 
-    def vlad(self, descriptors: Tensor) -> Tensor:
-        """Sum the residuals to the words: (B, NUM_WORDS * 64), normalised."""
-        if self.pool > 1:
-            descriptors = F.avg_pool2d(descriptors, self.pool)
-        cells = F.normalize(descriptors, dim=1)
-        share = self.assign(cells).softmax(dim=1).flatten(2)
-        sums = share @ cells.flatten(2).mT - share.sum(dim=2, keepdim=True) * self.words
+    def describe(self, fused: Tensor) -> Tensor:
+        """Return the descriptors of all cells (B, h w, 64), unit length."""
+        return F.normalize(self.desc(fused).flatten(2).transpose(1, 2), dim=2)
+
+    def vlad(self, cells: Tensor) -> Tensor:
+        """Sum the residuals of (B, N, 64) to the words: (B, NUM_WORDS * 64), normalised."""
+        # A sixty-fourth of the sums, so that 16-bit floats hold their squares.
+        share = self.assign(cells).softmax(dim=2).transpose(1, 2) / 64
+        sums = share @ cells - share.sum(dim=2, keepdim=True) * self.words
         return F.normalize(F.normalize(sums, dim=2).flatten(1), dim=1)
 
-    def forward(self, descriptors: Tensor) -> Tensor:
+    def forward(self, fused: Tensor) -> Tensor:
         """Return the global descriptors."""
-        return F.normalize(self.whiten(self.vlad(descriptors)), dim=1)
+        return F.normalize(self.whiten(self.vlad(self.describe(fused))), dim=1)
 
 
 def learn_head(
@@ -60,21 +61,19 @@ def learn_head(
 ) -> GlobalHead:
     """Learn words, sharpness and whitening from pictures of known places."""
     network.eval()
-    head = GlobalHead(STRIDE // network.profile.descriptor_stride)
+    head = GlobalHead(network)
     rng = np.random.default_rng(seed)
     owners: list[int] = []
-    maps: list[Tensor] = []
+    seen: list[Tensor] = []
     with torch.no_grad():
         for place, image in _views(flat, places, rng):
-            _, descriptors = network(standardize(torch.from_numpy(image)[None, None].float()))
-            pooled = F.avg_pool2d(descriptors, head.pool) if head.pool > 1 else descriptors
-            maps.append(pooled.half())
+            x = standardize(torch.from_numpy(image)[None, None].float())
+            with torch.autocast("cpu", torch.bfloat16):
+                _, fused = network.look(x)
+            seen.append(head.describe(fused.float()).half())
             owners.append(place)
-        cells = torch.cat([F.normalize(m.float(), dim=1).flatten(2)[0].T[::7] for m in maps])
-        _set_words(head, cells.numpy())
-        pool, head.pool = head.pool, 1
-        vlad = torch.cat([head.vlad(m.float()) for m in maps]).double().numpy()
-        head.pool = pool
+        _set_words(head, torch.cat([cells[0, ::7] for cells in seen]).float().numpy())
+        vlad = torch.cat([head.vlad(cells.float()) for cells in seen]).double().numpy()
         projection, mean = learn_whitening(vlad, np.array(owners))
         head.whiten.weight.copy_(torch.from_numpy(projection))
         head.whiten.bias.copy_(torch.from_numpy(-projection @ mean))
@@ -115,7 +114,7 @@ def _set_words(head: GlobalHead, cells: NDArray[np.float32]) -> None:
     sharpness = np.log(100) / np.mean(squared[:, 1] - squared[:, 0])
     centers = torch.from_numpy(words)
     head.words.copy_(centers)
-    head.assign.weight.copy_((2 * sharpness * centers)[..., None, None])
+    head.assign.weight.copy_(2 * sharpness * centers)
     head.assign.bias.copy_(-sharpness * centers.square().sum(dim=1))
 
 

@@ -13,7 +13,7 @@ import argparse
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -34,9 +34,9 @@ LAST_RATE = 0.02  # of the learning rate
 LOG_EVERY, CHECKPOINT_EVERY, VALIDATE_EVERY = 50, 500, 1000
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
-    arguments = parse()
+    arguments = parse(argv)
     torch.set_num_threads(arguments.threads)
     torch.manual_seed(arguments.seed)
     device = torch.device(arguments.device)
@@ -57,6 +57,8 @@ def main() -> None:
     start = 0
     if checkpoint.exists():
         state = torch.load(checkpoint, device)
+        if state["profile"] != dataclasses.asdict(PROFILES[arguments.profile]):
+            raise SystemExit(f"{checkpoint} is of another profile; name another folder with --out")
         network.load_state_dict(state["network"])
         losses.load_state_dict(state["losses"])
         optimizer.load_state_dict(state["optimizer"])
@@ -100,7 +102,7 @@ def main() -> None:
             draw_curve(log, arguments.out / "curve.png")
 
 
-def parse() -> argparse.Namespace:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("profile", choices=PROFILES)
@@ -114,7 +116,10 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--device", default="cpu")
-    return parser.parse_args()
+    arguments = parser.parse_args(argv)
+    if not arguments.photographs.is_dir():
+        parser.error(f"{arguments.photographs} is no folder of photographs")
+    return arguments
 
 
 def loader(pairs: Pairs, start: int, arguments: argparse.Namespace) -> Iterator:

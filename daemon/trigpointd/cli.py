@@ -15,6 +15,7 @@ import threadpoolctl
 import typer
 
 from trigpoint.errors import TrigpointError
+from trigpoint.models.features import find_model
 from trigpoint.output import check_output, open_text
 from trigpoint.poses import format_pose
 from trigpointd.config import Config, LogConfig, ModelConfig, SourceConfig, ZenohConfig, load_config
@@ -73,13 +74,19 @@ def replay(
         Path | None, typer.Option(help="Write `time_ns qw qx qy qz tx ty tz`, cam_from_world.")
     ] = None,
     topic: Annotated[str | None, typer.Option(help="The images' topic.")] = None,
-    model: Annotated[Path | None, typer.Option(help="A feature network; ours by default.")] = None,
+    model: Annotated[str, typer.Option(help="tiny, base, or a file (.onnx).")] = "base",
+    retrieval: Annotated[
+        Path | None, typer.Option(help="A retrieval network, where the other needs one.")
+    ] = None,
+    matcher: Annotated[
+        Path | None, typer.Option(help="A matching network; mutual nearest neighbours by default.")
+    ] = None,
 ) -> None:
     """Localize every frame of a recording, as fast as it goes."""
     config = Config(
         map=map_,
         source=SourceConfig(type="mcap", path=recording, image_topic=topic),
-        model=ModelConfig(path=model),
+        model=ModelConfig(network=find_model(model), retrieval=retrieval, matcher=matcher),
         log=None if log is None else LogConfig(path=log),
     )
     totals = run(config, poses=poses)

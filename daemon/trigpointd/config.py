@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from trigpoint.errors import ConfigError
+from trigpoint.models.features import Profile
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import LocalizerOptions
 
@@ -56,10 +57,19 @@ class CameraConfig(Section):
 
 
 class ModelConfig(Section):
-    """Which network, and how it runs."""
+    """Which networks, and how they run."""
 
-    path: Path | None = None  # the packaged one by default
-    num_threads: Annotated[int, Field(ge=1, le=64)] = 2
+    network: Profile | Path = "base"
+    retrieval: Path | None = None  # for the global descriptor; needed where `network` gives none
+    matcher: Path | None = None  # mutual nearest neighbours by default
+    num_threads: Annotated[int, Field(ge=1, le=64)] = 2  # of each
+
+    @field_validator("network", mode="before")
+    @classmethod
+    def _named(cls, network: object) -> object:
+        if not isinstance(network, str | Path):
+            raise ValueError("must be 'tiny', 'base' or a file")  # noqa: TRY004
+        return network
 
 
 class ZenohConfig(Section):

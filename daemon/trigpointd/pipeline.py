@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 
 from trigpoint.database.reader import MapReader
-from trigpoint.errors import DatabaseError
+from trigpoint.errors import DatabaseError, ModelError
 from trigpoint.frame import Failed, Frame, Localized, Result, describe, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.rigid import Rigid3
@@ -95,8 +95,10 @@ class Pipeline:
             return Failed("BAD_FRAME", frame.detail)
         try:
             return self._localizer.localize(frame)
-        except DatabaseError as error:  # a damaged image; frames elsewhere can do without it
+        except (DatabaseError, ModelError) as error:
+            # A damaged image of the map, or a network that fails on this frame: others may do.
             if str(error) not in self._damage:
                 self._damage.add(str(error))
                 _log.error("%s", error)
-            return Failed("BAD_MAP", str(error))
+            reason = "BAD_MAP" if isinstance(error, DatabaseError) else "BAD_NETWORK"
+            return Failed(reason, str(error))

@@ -18,6 +18,7 @@ from trigpoint.database.reader import MapReader
 from trigpoint.errors import TrigpointError
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
+from trigpoint.models.matching import load_matcher
 from trigpoint.output import check_output
 from trigpointd.config import Config
 from trigpointd.latest import Latest
@@ -76,10 +77,18 @@ def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink
 
 @contextlib.contextmanager
 def open_pipeline(config: Config) -> Iterator[Pipeline]:
-    """Load the network and open the map."""
-    model = FeatureModel.load(config.model.path, num_threads=config.model.num_threads)
+    """Load the networks and open the map."""
+    settings = config.model
+    model = FeatureModel.load(
+        settings.network, retrieval=settings.retrieval, num_threads=settings.num_threads
+    )
+    matcher = load_matcher(
+        settings.matcher, model.identity.descriptor_dim, num_threads=settings.num_threads
+    )
     with MapReader.open(config.map, model.identity) as reader:
-        localizer = Localizer(model, reader, config.localizer, clock=time.perf_counter)
+        localizer = Localizer(
+            model, reader, config.localizer, clock=time.perf_counter, matcher=matcher
+        )
         yield Pipeline(localizer, reader, config.camera.body_from_camera, config.map_frame)
 
 

@@ -24,16 +24,18 @@ from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError, SourceError, TrigpointError
 from trigpoint.frame import Failed, Localized, describe, summarize
 from trigpoint.localizer import Localizer
-from trigpoint.models.features import FeatureModel
+from trigpoint.models.features import FeatureModel, find_model
+from trigpoint.models.matching import load_matcher
 from trigpoint.output import check_output, open_text
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import LocalizerOptions
+from trigpoint_db.adapt import adapt_model
 from trigpoint_db.build import append_map, build_map, check_files, select_images
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
-from trigpoint_db.localize import Outcome, localize_images
+from trigpoint_db.localize import localize_images
 from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
 from trigpoint_db.recording import FORMATS, RecordedImage, write_recording
 
@@ -46,7 +48,10 @@ app = typer.Typer(
 )
 console = Console()
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
-Model = Annotated[Path | None, typer.Option(help="A feature network; ours by default.")]
+Model = Annotated[str, typer.Option(help="The network: tiny, base, or a file (.onnx).")]
+Retrieval = Annotated[
+    Path | None, typer.Option(help="A retrieval network, where the other needs one beside it.")
+]
 MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="A .tpmap file.")]
 
 
@@ -71,7 +76,8 @@ def build(
     list_: Annotated[Path | None, typer.Option("--list", help="Only these names.")] = None,
     append: Annotated[bool, typer.Option("--append", help="Add to a map.")] = False,
     keypoints: Annotated[int, typer.Option(help="At most so many an image.", min=50)] = 1024,
-    model: Model = None,
+    model: Model = "base",
+    retrieval: Retrieval = None,
     as_json: Json = False,
 ) -> None:
     """Make a map from images with known poses."""
@@ -83,7 +89,7 @@ def build(
     check_output(map_)
     check_files((image.name for image in posed), images)
     write = append_map if append else build_map
-    network = FeatureModel.load(model)
+    network = FeatureModel.load(model, retrieval=retrieval)
     count = write(
         map_, track(posed, "mapping", len(posed)), images, network, max_keypoints=keypoints
     )
@@ -102,7 +108,11 @@ def localize(
     poses: Annotated[Path, typer.Option(help="Write `name qw qx qy qz tx ty tz`.")],
     results: Annotated[Path | None, typer.Option(help="Write a JSON line a query.")] = None,
     anchors: Annotated[int, typer.Option(help="How many to retrieve.", min=2)] = 20,
-    model: Model = None,
+    model: Model = "base",
+    retrieval: Retrieval = None,
+    matcher: Annotated[
+        Path | None, typer.Option(help="A matching network; mutual nearest neighbours by default.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Localize images; OK poses go to a file, what came of every query to another."""
@@ -112,13 +122,17 @@ def localize(
     if not wanted:
         raise ConfigError(f"{queries} names no images")
     check_files((query.name for query in wanted), images)
-    network = FeatureModel.load(model)
+    network = FeatureModel.load(model, retrieval=retrieval)
+    matching = load_matcher(matcher, network.identity.descriptor_dim)
+    options = LocalizerOptions(num_anchors=anchors)
     with MapReader.open(map_, network.identity) as reader, ExitStack() as stack:
         if len(reader) == 0:
             raise ConfigError(f"{map_} holds no images; add some: trigpoint-db build --append")
         lines = None if results is None else stack.enter_context(open_text(results))
+        localizer = Localizer(network, reader, options, time.perf_counter, matching)
+        localized = localize_images(localizer, wanted, images)
         outcomes = []
-        for outcome in _localize(reader, network, wanted, images, anchors):
+        for outcome in track(localized, "localizing", len(wanted)):
             outcomes.append(outcome)
             if lines is not None:
                 lines.write(json.dumps({"name": outcome.name, **describe(outcome.result)}) + "\n")
@@ -138,14 +152,6 @@ def localize(
             f"no query was localized: {others}; --results says more of each, and whether the map "
             "shows their place only you can tell"
         )
-
-
-def _localize(
-    reader: MapReader, network: FeatureModel, queries: list[Query], folder: Path, anchors: int
-) -> Iterator[Outcome]:
-    options = LocalizerOptions(num_anchors=anchors)
-    localizer = Localizer(network, reader, options, clock=time.perf_counter)
-    yield from track(localize_images(localizer, queries, folder), "localizing", len(queries))
 
 
 @app.command("evaluate")
@@ -269,6 +275,113 @@ def _image_names(folder: Path) -> list[str]:
     if not names:
         raise ConfigError(f"{folder} holds no images ({', '.join(FORMATS)})")
     return names
+
+
+@app.command()
+def adapt(
+    model: Annotated[Path, typer.Argument(metavar="MODEL.onnx", help="A network made elsewhere.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.onnx", help="The same, with a contract.")],
+    kind: Annotated[str, typer.Option(help="features, retrieval or matcher.")],
+    name: Annotated[str | None, typer.Option(help="For people; the file's by default.")] = None,
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TENSOR=NAME", help="What the file calls a tensor of the contract."),
+    ] = None,
+    layout: Annotated[str | None, typer.Option(help="dense or sparse.")] = None,
+    descriptor_dim: Annotated[int | None, typer.Option(help="Of the local descriptors.")] = None,
+    global_dim: Annotated[int | None, typer.Option(help="Of the global descriptor.")] = None,
+    channels: Annotated[int | None, typer.Option(help="1 or 3.")] = None,
+    normalization: Annotated[
+        str | None, typer.Option(help="standardize, unit, imagenet or raw.")
+    ] = None,
+    multiple_of: Annotated[int | None, typer.Option(help="Of height and width.")] = None,
+    long_side_px: Annotated[int | None, typer.Option(help="Larger images are scaled down.")] = None,
+    height: Annotated[int | None, typer.Option(help="Of a retrieval network's input.")] = None,
+    width: Annotated[int | None, typer.Option(help="Of a retrieval network's input.")] = None,
+    min_score: Annotated[float | None, typer.Option(help="Of a keypoint or a match.")] = None,
+    keypoints: Annotated[str | None, typer.Option(help="px, normalized or centered.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Make a network fit in: check what it is said to be, and write that into it."""
+    options = {
+        key: value
+        for key, value in locals().items()
+        if key not in ("model", "out", "rename", "as_json") and value is not None
+    }
+    names = dict(_split_names(rename or []))
+    contract, found = adapt_model(model, out, {"name": model.stem, "names": names} | options)
+    if as_json:
+        print(json.dumps({"model": str(out), "contract": contract.model_dump(), "found": found}))
+    else:
+        print(f"{out}: {contract.kind}, {found} in a trial")
+
+
+def _split_names(renames: list[str]) -> Iterator[tuple[str, str]]:
+    for rename in renames:
+        tensor, separator, name = rename.partition("=")
+        if not (tensor and separator and name):
+            raise ConfigError(f"--rename wants TENSOR=NAME, such as image=input, not {rename!r}")
+        yield tensor, name
+
+
+@app.command("quantize")
+def quantize_command(
+    model: Annotated[Path, typer.Argument(metavar="MODEL.onnx", help="A float feature network.")],
+    images: Annotated[Path, typer.Option(help="Folder of images like those it will see.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The INT8 network; MODEL.int8.onnx by default.")
+    ] = None,
+    colmap: Annotated[
+        Path | None, typer.Option(help="A COLMAP model of the images: poses count on them, too.")
+    ] = None,
+    max_loss: Annotated[
+        float, typer.Option(help="Of fp32's matching score or pose accuracy.", min=0, max=1)
+    ] = 0.02,
+    pairs: Annotated[
+        int, typer.Option(help="To compare on; more pairs, less noise.", min=12)
+    ] = 120,
+    float_layers: Annotated[
+        bool, typer.Option(help="Leave in float what loses too much; without: all is INT8.")
+    ] = True,
+    as_json: Json = False,
+) -> None:
+    """Make a feature network INT8, compare it with fp32, and write it if little is lost."""
+    from trigpoint_db.quantize import QuantizationOptions, quantize  # imports onnx, an extra
+
+    out = model.with_suffix(".int8.onnx") if out is None else out
+    options = QuantizationOptions(
+        max_loss=max_loss, keep_float=float_layers, num_warped=pairs, num_rendered=2 * pairs
+    )
+    paths = [images / name for name in _image_names(images)]
+    posed = None if colmap is None else (read_model(colmap), images)
+    report = quantize(model, paths, out, options=options, posed=posed, track=track)
+    if as_json:
+        print(json.dumps(report.to_json()))
+    else:
+        report.print_table(console)
+    if report.refusal is not None:
+        raise ConfigError(f"{out} is not written: {report.refusal}")
+    if not as_json:
+        print(f"{out}: {report.num_bytes[1]} bytes")
+
+
+@app.command("export-oak")
+def export_oak_command(
+    model: Annotated[str, typer.Argument(help="tiny, base, or a file (.onnx).")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.tar.xz", help="The archive.")],
+    height: Annotated[int, typer.Option(help="Of the image on the device.", min=1)] = 480,
+    width: Annotated[int, typer.Option(help="Of the image on the device.", min=1)] = 640,
+    as_json: Json = False,
+) -> None:
+    """Write a feature network as an NN Archive, for Luxonis cameras (docs/oak.md)."""
+    from trigpoint_db.export_oak import export_oak  # imports onnx, an extra
+
+    config = export_oak(find_model(model), out, height=height, width=width)
+    if as_json:
+        print(json.dumps({"archive": str(out), "config": config}))
+    else:
+        outputs = ", ".join(f"{o['name']} {o['shape']}" for o in config["model"]["outputs"])
+        print(f"{out}: gray {width} x {height} to {outputs}")
 
 
 @app.command()

@@ -55,7 +55,7 @@ class LocalFeatures:
     descriptors : (N, D) float32
         L2-normalised.
     scores : (N,) float32
-        The detector's logits.
+        The detector's, falling.
     global_descriptor : (G,) float32
         L2-normalised, for retrieval.
     """
@@ -110,6 +110,7 @@ class Statistics:
     num_features: int = 0
     num_anchors: int = 0  # retrieved
     num_matches: int = 0  # over all anchors
+    num_matcher_failures: int = 0  # anchors that a matching network failed on
     num_consistent_anchors: int = 0  # that agree in stage 1
     num_points: int = 0  # latent points
     num_inliers: int = 0  # latent points that agree with the final pose
@@ -150,7 +151,7 @@ class Lost:
 
 @dataclass(frozen=True)
 class Failed:
-    """No localization at all: a BAD_FRAME that cannot be read, or a BAD_MAP that was needed."""
+    """No localization at all: a BAD_FRAME that cannot be read, a BAD_MAP or a BAD_NETWORK."""
 
     reason: str
     detail: str

@@ -15,6 +15,7 @@ from trigpoint.database.reader import MapReader
 from trigpoint.frame import Frame, Localized, Lost, Reason, Result, Statistics
 from trigpoint.geometry.triangulation import triangulate_robust
 from trigpoint.models.features import FeatureModel
+from trigpoint.models.matching import Matcher, MutualNearestNeighbors
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import (
     LocalizerOptions,
@@ -42,6 +43,8 @@ class Localizer:
     options : LocalizerOptions, optional
     clock : callable, optional
         Seconds, monotonic; without it the results have no stage times.
+    matcher : Matcher, optional
+        Mutual nearest neighbours by default, and where it fails.
     """
 
     def __init__(
@@ -50,11 +53,13 @@ class Localizer:
         reader: MapReader,
         options: LocalizerOptions | None = None,
         clock: Callable[[], float] | None = None,
+        matcher: Matcher | None = None,
     ) -> None:
         self.model = model
         self.reader = reader
         self.options = options or LocalizerOptions()
         self.clock = clock
+        self.matcher = matcher or MutualNearestNeighbors()
 
     def localize(self, frame: Frame) -> Result:
         """Estimate cam_from_world of a frame, with covariance, or say why not."""
@@ -79,8 +84,8 @@ class Localizer:
             return trace.lost(Reason.FEW_ANCHORS, "the map holds a single image")
 
         with trace.stage("matching"):
-            query = match_anchors(frame, features, anchors, self.model.contract.long_side_px)
-        trace.note(num_matches=len(query.tracks))
+            query = match_anchors(frame, features, anchors, self.matcher, self.model.long_side_px)
+        trace.note(num_matches=len(query.tracks), num_matcher_failures=query.num_matcher_failures)
 
         with trace.stage("latent_points"):
             latent = triangulate_robust(

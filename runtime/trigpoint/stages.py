@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
-from trigpoint.errors import ConfigError
+from trigpoint.errors import ConfigError, ModelError
 from trigpoint.frame import Anchor, Frame, LocalFeatures, Reason
 from trigpoint.geometry.absolute_pose import estimate_absolute_pose
 from trigpoint.geometry.anchor_ransac import NoConsensus, find_consensus
@@ -28,7 +28,7 @@ from trigpoint.geometry.pose_refinement import RefinedPose, refine_pose, reproje
 from trigpoint.geometry.relative_pose import estimate_relative_pose
 from trigpoint.geometry.rotation_averaging import average_rotations
 from trigpoint.geometry.triangulation import LatentPoints, Tracks, triangulate_robust
-from trigpoint.models.matching import match_mutual
+from trigpoint.models.matching import Matchable, Matcher, match_mutual
 from trigpoint.rigid import Rigid3
 
 Array = NDArray[np.float64]
@@ -92,6 +92,8 @@ class Query:
         By anchor: query's keypoint, row in `anchor_points`; best first.
     anchor_points : list of (M, 2) float64
         By anchor: where its matched keypoints are, in the order of `matches`.
+    num_matcher_failures : int
+        Anchors for which the matcher failed; these have mutual nearest neighbours.
     """
 
     points: Array
@@ -101,18 +103,29 @@ class Query:
     tracks: Tracks
     matches: list[Index]
     anchor_points: list[Array]
+    num_matcher_failures: int
 
 
 def match_anchors(
-    frame: Frame, features: LocalFeatures, anchors: Sequence[Anchor], long_side_px: int
+    frame: Frame,
+    features: LocalFeatures,
+    anchors: Sequence[Anchor],
+    matcher: Matcher,
+    long_side_px: int,
 ) -> Query:
     """Match the query's features with each anchor's and normalise what matched."""
     points = frame.camera.normalize(features.keypoints)
     seen = np.asarray(np.isfinite(points).all(axis=1))
     matches: list[Index] = []
     anchor_points: list[Array] = []
+    num_failures = 0
+    query = _matchable(features, frame.camera)
     for anchor in anchors:
-        pairs, _ = match_mutual(features.descriptors, anchor.descriptors)
+        try:
+            pairs, _ = matcher.match(query, _matchable(anchor, anchor.camera))
+        except ModelError:  # a network that does not run on these features: do without
+            pairs, _ = match_mutual(features.descriptors, anchor.descriptors)
+            num_failures += 1
         xy = anchor.camera.normalize(anchor.keypoints[pairs[:, 1]])
         usable = seen[pairs[:, 0]] & np.isfinite(xy).all(axis=1)
         matches.append(pairs[usable, 0])
@@ -131,7 +144,12 @@ def match_anchors(
         tracks,
         matches,
         anchor_points,
+        num_failures,
     )
+
+
+def _matchable(features: LocalFeatures | Anchor, camera: Camera) -> Matchable:
+    return Matchable(features.keypoints, features.descriptors, camera.width, camera.height)
 
 
 def pixel_size(camera: Camera, long_side_px: int) -> float:

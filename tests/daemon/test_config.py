@@ -76,6 +76,8 @@ path = "/var/log/trigpoint.mcap"
         (MINIMAL + "[localizer]\nnum_anchors = '20'", "'localizer.num_anchors': .*valid integer"),
         (MINIMAL + "[log]\npath = 'a'\nframes = 0", "'log.frames': .*valid boolean"),
         (MINIMAL + "[localizer]\nmin_inlier_ratio = 40", "min_inlier_ratio must be at most 1"),
+        (MINIMAL + "[model]\nnetwork = 3", "'model.network': .* 'tiny', 'base' or"),
+        (MINIMAL + "[model]\npath = 'a'", "unknown key 'model.path'"),
         ("map = ", "is not TOML"),
     ],
 )  # fmt: skip
@@ -85,6 +87,17 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, text: str, message: s
         load_config(path)
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(str(path))
+
+
+def test_a_network_is_a_profile_or_a_file_beside_the_settings(tmp_path: Path) -> None:
+    assert load_config(write(tmp_path, MINIMAL)).model.network == "base"
+    tiny = load_config(write(tmp_path, MINIMAL + '[model]\nnetwork = "tiny"')).model
+    assert (tiny.network, tiny.retrieval, tiny.matcher) == ("tiny", None, None)
+    text = '[model]\nnetwork = "a.onnx"\nretrieval = "b.onnx"\nmatcher = "/opt/c.onnx"'
+    files = load_config(write(tmp_path, MINIMAL + text)).model
+    assert files.network == tmp_path / "a.onnx"
+    assert files.retrieval == tmp_path / "b.onnx"
+    assert files.matcher == Path("/opt/c.onnx")
 
 
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from tests.conftest import Demo
+from tests.unit.graphs import for_one_size
+from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
 from trigpoint.frame import Frame, ModelIdentity
@@ -99,3 +101,18 @@ def test_a_damaged_image_of_the_map_costs_the_frames_that_need_it_alone(
         assert "damaged" in failed["detail"]
         black = Frame(np.zeros((480, 640), np.uint8), CAMERA)
         assert status(pipeline, Captured(black, 6))["reason"] == "TOO_DARK"
+
+
+def test_a_network_that_fails_on_a_frame_costs_that_frame_alone(
+    demo: Demo, survey: list[PosedImage], captured: Captured, tmp_path: Path
+) -> None:
+    network = FeatureModel.load(for_one_size(tmp_path / "n.onnx", CAMERA.height, CAMERA.width))
+    build_map(tmp_path / "n.tpmap", survey[:1], demo.folder / "survey", network)
+    small = Camera("PINHOLE", 320, 240, (230.0, 230.0, 159.5, 119.5))
+    assert isinstance(captured.frame, Frame)
+    halved = Frame(np.ascontiguousarray(captured.frame.image[::2, ::2]), small, time_ns=6)
+    with MapReader.open(tmp_path / "n.tpmap", network.identity) as reader:
+        pipeline = Pipeline(Localizer(network, reader), reader, Rigid3.identity(), "map")
+        failed = status(pipeline, Captured(halved, log_time_ns=6))
+        assert (failed["status"], failed["reason"]) == ("FAILED", "BAD_NETWORK")
+        assert status(pipeline, captured)["status"] == "LOST"

@@ -1,4 +1,3 @@
-import shutil
 from pathlib import Path
 
 import cv2
@@ -9,13 +8,10 @@ from numpy.typing import NDArray
 
 from tests.unit.scenes import generator
 from trigpoint.errors import ModelError
-from trigpoint.models.features import (
-    FeatureModel,
-    packaged_model,
-    sample_bilinear,
-    select_keypoints,
-)
-from trigpoint.models.session import METADATA_KEY, Contract
+from trigpoint.models.contract import METADATA_KEY, FeaturesContract
+from trigpoint.models.dense import sample_bilinear, select_keypoints
+from trigpoint.models.features import PROFILES, FeatureModel, find_model, packaged_model
+from trigpoint.models.inputs import to_tensor
 
 
 def checkers(height: int = 240, width: int = 320, key: str = "checkers") -> NDArray[np.uint8]:
@@ -63,10 +59,18 @@ def test_a_plateau_is_no_keypoint() -> None:
 
 def test_bilinear_sampling_reproduces_a_linear_map() -> None:
     v, u = np.mgrid[:6, :8].astype(np.float32)
-    values = np.stack([u, v, 2 * u - v], axis=-1)
+    values = np.stack([u, v, 2 * u - v])
     points = generator("bilinear").uniform([0, 0], [7, 5], (50, 2)).astype(np.float32)
     expected = np.c_[points, 2 * points[:, 0] - points[:, 1]]
     np.testing.assert_allclose(sample_bilinear(values, points), expected, atol=1e-5)
+
+
+def test_bilinear_sampling_is_clamped_at_the_edge() -> None:
+    values = np.arange(12, dtype=np.float32).reshape(1, 3, 4)
+    points = np.array([[-1, -1], [9, 9], [3, 0.5], [1.5, 2]], np.float32)
+    np.testing.assert_allclose(sample_bilinear(values, points)[:, 0], [0, 11, 5, 9.5])
+    one_cell = sample_bilinear(values[:, :1, :1], points)
+    np.testing.assert_allclose(one_cell, 0)
 
 
 def test_features_keep_their_promises(model: FeatureModel) -> None:
@@ -122,56 +126,55 @@ def test_a_blank_image_has_no_features(model: FeatureModel) -> None:
     assert len(model.extract(np.full((240, 320), 128, np.uint8))) == 0
 
 
-def broken_copy(folder: Path, metadata: str | None) -> Path:
+def test_another_network_is_a_file_away(model: FeatureModel, tmp_path: Path) -> None:
     network = onnx.load(packaged_model())
+    contract = model.network.contract.model_copy(update={"name": "other", "normalization": "unit"})
     del network.metadata_props[:]
-    if metadata is not None:
-        onnx.helper.set_model_props(network, {METADATA_KEY: metadata})
-    onnx.save(network, folder / "broken.onnx")
-    shutil.copy(packaged_model().with_name("pilot.vlad.npz"), folder)
-    return folder / "broken.onnx"
-
-
-def contract(**changes: object) -> str:
-    fields: dict[str, object] = {
-        "name": "other", "descriptor_dim": 64, "multiple_of": 32, "long_side_px": 640,
-        "normalization": "standardize", "min_score": -2.0, "vocabulary": "pilot.vlad.npz",
-    }  # fmt: skip
-    return Contract(**{**fields, **changes}).to_json()  # type: ignore[arg-type]
-
-
-def test_another_network_is_a_file_away(tmp_path: Path) -> None:
-    other = FeatureModel.load(broken_copy(tmp_path, contract(normalization="unit")))
+    onnx.helper.set_model_props(network, {METADATA_KEY: contract.to_json()})
+    onnx.save(network, tmp_path / "other.onnx")
+    other = FeatureModel.load(tmp_path / "other.onnx", num_threads=1)
     assert other.identity.name == "other"
-    assert other.identity.sha256 != FeatureModel.load().identity.sha256
+    assert other.identity.sha256 != model.identity.sha256
     assert len(other.extract(checkers(), 100)) > 0
 
 
-@pytest.mark.parametrize(
-    ("metadata", "message"),
-    [
-        (None, "has no 'trigpoint' metadata"),
-        ("{}", "metadata is not this version's contract"),
-        ("not json", "metadata is not this version's contract"),
-        (contract().replace("standardize", "whiten"), "'whiten' is not known"),
-        (contract(descriptor_dim=128), r"by its metadata it is \(1, 128, height, width\)"),
-        (contract(vocabulary="none.npz"), "no such retrieval vocabulary"),
-    ],
-)
-def test_a_network_that_breaks_the_contract_is_refused(
-    tmp_path: Path, metadata: str | None, message: str
-) -> None:
-    with pytest.raises(ModelError, match=message):
-        FeatureModel.load(broken_copy(tmp_path, metadata))
+def test_the_base_profile_is_the_default(model: FeatureModel) -> None:
+    assert find_model("base") == packaged_model() == packaged_model("base")
+    assert model.identity == FeatureModel.load("base", num_threads=1).identity
+    assert len({find_model(profile) for profile in PROFILES}) == 3
 
 
 def test_files_that_are_no_networks_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="no such model file"):
+    with pytest.raises(ModelError, match=r"no such model file: .* in the box: tiny, base"):
         FeatureModel.load(tmp_path / "missing.onnx")
+    with pytest.raises(ModelError, match="no such model file: big; in the box"):
+        FeatureModel.load("big")
     (tmp_path / "text.onnx").write_text("hello")
     with pytest.raises(ModelError, match="not a network that onnxruntime can load"):
         FeatureModel.load(tmp_path / "text.onnx")
-    path = broken_copy(tmp_path, contract())
-    path.with_name("pilot.vlad.npz").write_bytes(b"PK not an archive")
-    with pytest.raises(ModelError, match="is not a retrieval vocabulary"):
-        FeatureModel.load(path)
+    with pytest.raises(ModelError, match="no such model file"):
+        FeatureModel.load(retrieval=tmp_path / "missing.onnx")
+
+
+@pytest.mark.parametrize("normalization", ["standardize", "unit", "raw", "imagenet"])
+def test_a_tensor_is_normalised_as_the_contract_says(normalization: str) -> None:
+    image = checkers()
+    contract = FeaturesContract(
+        name="a",
+        descriptor_dim=1,
+        channels=3,
+        normalization=normalization,  # type: ignore[arg-type]
+    )
+    tensor = to_tensor(image, contract)
+    assert tensor.shape == (1, 3, *image.shape)
+    assert tensor.dtype == np.float32
+    x = image.astype(np.float64)
+    expected = {
+        "standardize": [np.clip((x - x.mean()) / max(x.std(), 4), -4, 4)] * 3,
+        "unit": [x / 255] * 3,
+        "raw": [x] * 3,
+        "imagenet": [
+            (x / 255 - mean) / std for mean, std in ((0.485, 0.229), (0.456, 0.224), (0.406, 0.225))
+        ],
+    }[normalization]
+    np.testing.assert_allclose(tensor[0], expected, atol=1e-4)

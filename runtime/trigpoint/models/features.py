@@ -1,162 +1,92 @@
-"""From an image to keypoints, local descriptors and the global descriptor, in one network pass."""
+"""From an image to keypoints, local descriptors and the global descriptor."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Literal, get_args
 
-import cv2
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 from trigpoint.errors import ModelError
 from trigpoint.frame import LocalFeatures, ModelIdentity
-from trigpoint.models.retrieval import Vocabulary
-from trigpoint.models.session import (
-    DESCRIPTORS,
-    INPUT,
-    SCORE,
-    Contract,
-    hash_files,
-    open_session,
-)
+from trigpoint.models.local import FeatureNetwork
+from trigpoint.models.retrieval import RetrievalModel
+from trigpoint.models.session import hash_files
 
-Array32 = NDArray[np.float32]
-
-NMS_SIZE = 5  # px of the network's input
-MIN_CURVATURE = np.float32(1e-3)  # logits / px^2
-BORDER = 4  # px in which the network has seen too little to tell a keypoint
+Profile = Literal["tiny", "base"]
+PROFILES: tuple[Profile, ...] = get_args(Profile)
 
 
-def packaged_model() -> Path:
-    """Return the path of the network in the box."""
-    return Path(str(resources.files("trigpoint.models") / "weights" / "pilot.int8.onnx"))
+def packaged_model(profile: Profile = "base") -> Path:
+    """Return the path of a network in the box."""
+    return Path(str(resources.files("trigpoint.models") / "weights" / f"{profile}.int8.onnx"))
+
+
+def find_model(name: str | Path) -> Path:
+    """Return the path of a network: a profile's in the box, or a file's."""
+    for profile in PROFILES:
+        if name == profile:
+            return packaged_model(profile)
+    path = Path(name)
+    if not path.is_file():
+        raise ModelError(f"no such model file: {path}; in the box: {', '.join(PROFILES)}")
+    return path
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureModel:
-    """A feature network with its retrieval vocabulary."""
+    """A feature network, with a retrieval network where it gives no global descriptor itself."""
 
-    session: ort.InferenceSession
-    contract: Contract
-    vocabulary: Vocabulary
+    network: FeatureNetwork
+    retrieval: RetrievalModel | None
     identity: ModelIdentity
 
     @classmethod
-    def load(cls, path: Path | None = None, *, num_threads: int = 2) -> FeatureModel:
-        """Load a network (the packaged one by default) and the vocabulary beside it."""
-        path = path or packaged_model()
-        session, contract = open_session(path, num_threads)
-        vocabulary_path = path.with_name(contract.vocabulary)
-        vocabulary = Vocabulary.load(vocabulary_path, contract.descriptor_dim)
-        identity = ModelIdentity(
-            contract.name,
-            hash_files(path, vocabulary_path),
-            contract.descriptor_dim,
-            vocabulary.global_dim,
-        )
-        return cls(session, contract, vocabulary, identity)
+    def load(
+        cls, name: str | Path = "base", *, retrieval: Path | None = None, num_threads: int = 2
+    ) -> FeatureModel:
+        """Load a network.
+
+        Parameters
+        ----------
+        name : str or Path
+            A profile in the box ("tiny", "base"), or a file.
+        retrieval : Path, optional
+            A network for the global descriptor; needed where the other gives none.
+        num_threads : int
+            Of each network.
+        """
+        path = find_model(name)
+        network = FeatureNetwork.load(path, num_threads=num_threads)
+        contract = network.contract
+        if retrieval is not None:
+            describer = RetrievalModel.load(retrieval, num_threads=num_threads)
+            label = f"{contract.name} + {describer.contract.name}"
+            sha256, global_dim = hash_files(path, retrieval), describer.contract.global_dim
+        elif contract.global_dim:
+            describer, label = None, contract.name
+            sha256, global_dim = hash_files(path), contract.global_dim
+        else:
+            raise ModelError(
+                f"{path} gives no global descriptor; name a retrieval network beside it: "
+                "`retrieval` in [model], or --retrieval (docs/models.md)"
+            )
+        identity = ModelIdentity(label, sha256, contract.descriptor_dim, global_dim)
+        return cls(network, describer, identity)
+
+    @property
+    def long_side_px(self) -> int:
+        """How long a side of an image the network sees at the most."""
+        return self.network.long_side_px
 
     def extract(self, image: NDArray[np.uint8], max_keypoints: int = 1024) -> LocalFeatures:
         """Extract at most `max_keypoints` features of a gray image (H, W), best score first."""
-        small = _fit(image, self.contract)
-        try:
-            score, desc = self.session.run(
-                [SCORE, DESCRIPTORS], {INPUT: _standardize(small, self.contract)[None, None]}
-            )
-        except Exception as error:  # onnxruntime's errors share no narrower base
-            reason = str(error).splitlines()[0]
-            raise ModelError(f"the network {self.contract.name!r} cannot run: {reason}") from error
-        points, scores = select_keypoints(score[0, 0], max_keypoints, self.contract.min_score)
-        dim, rows, columns = desc.shape[1:]
-        dense = np.ascontiguousarray(desc[0].reshape(dim, -1).T)
-        scale = np.array([columns / small.shape[1], rows / small.shape[0]], dtype=np.float32)
-        local = sample_bilinear(dense.reshape(rows, columns, dim), (points + 0.5) * scale - 0.5)
-        zoom: Array32 = np.divide(image.shape[::-1], small.shape[::-1]).astype(np.float32)
-        return LocalFeatures(
-            keypoints=(points + 0.5) * zoom - 0.5,
-            descriptors=self.vocabulary.center(local),
-            scores=scores,
-            global_descriptor=self.vocabulary.describe(self.vocabulary.center(dense)),
-        )
-
-
-def _fit(image: NDArray[np.uint8], contract: Contract) -> NDArray[np.uint8]:
-    """Scale to the network's long side and to multiples of its stride, axis by axis."""
-    zoom = min(1.0, contract.long_side_px / max(image.shape))
-    step = contract.multiple_of
-    height, width = (max(step, round(size * zoom / step) * step) for size in image.shape)
-    if (height, width) == image.shape:
-        return image
-    smaller = height < image.shape[0] or width < image.shape[1]
-    interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, (width, height), interpolation=interpolation), np.uint8)
-
-
-def _standardize(image: NDArray[np.uint8], contract: Contract) -> Array32:
-    if contract.normalization == "unit":
-        return image.astype(np.float32) / np.float32(255)
-    mean, std = cv2.meanStdDev(image)
-    standard = (image.astype(np.float32) - np.float32(mean[0, 0])) / np.float32(max(std[0, 0], 4.0))
-    return np.clip(standard, -4, 4, out=standard)
-
-
-def select_keypoints(
-    score: Array32, max_keypoints: int, min_score: float
-) -> tuple[Array32, Array32]:
-    """Pick the strongest local maxima of a score map and refine them to sub-pixel.
-
-    Parameters
-    ----------
-    score : (H, W) float32
-        Logits.
-    max_keypoints : int
-        How many at the most.
-    min_score : float
-        Lowest logit of a keypoint.
-
-    Returns
-    -------
-    points : (N, 2) float32
-        x, y in px, refined by a parabola through the neighbours in each direction.
-    scores : (N,) float32
-        Falling.
-    """
-    peaks = (score > min_score) & (
-        score >= cv2.dilate(score, np.ones((NMS_SIZE, NMS_SIZE), np.uint8))
-    )
-    peaks[:BORDER] = peaks[-BORDER:] = False
-    peaks[:, :BORDER] = peaks[:, -BORDER:] = False
-    y, x = np.nonzero(peaks)
-    values = score[y, x]
-    dx, curvature_x = _parabola(score[y, x - 1], values, score[y, x + 1])
-    dy, curvature_y = _parabola(score[y - 1, x], values, score[y + 1, x])
-    # A plateau, such as a blank image gives, is no keypoint.
-    pointed = np.flatnonzero(np.minimum(curvature_x, curvature_y) > MIN_CURVATURE)
-    best = pointed[np.argsort(-values[pointed], kind="stable")[:max_keypoints]]
-    points = np.stack([x + dx, y + dy], axis=1)[best]
-    return points.astype(np.float32), values[best]
-
-
-def _parabola(before: Array32, at: Array32, after: Array32) -> tuple[Array32, Array32]:
-    """Offset in [-0.5, 0.5] of the top of a parabola through three neighbours; its curvature."""
-    curvature = 2 * at - before - after
-    offset = 0.5 * (after - before) / np.maximum(curvature, MIN_CURVATURE)
-    return np.clip(offset, -0.5, 0.5), curvature
-
-
-def sample_bilinear(values: Array32, points: Array32) -> Array32:
-    """Interpolate a map (rows, columns, D) at x, y (N, 2) in its pixels, clamped at the edge."""
-    rows, columns = values.shape[:2]
-    x = np.clip(points[:, 0], 0, columns - 1)
-    y = np.clip(points[:, 1], 0, rows - 1)
-    x0 = np.minimum(x.astype(np.intp), max(columns - 2, 0))
-    y0 = np.minimum(y.astype(np.intp), max(rows - 2, 0))
-    x1, y1 = np.minimum(x0 + 1, columns - 1), np.minimum(y0 + 1, rows - 1)
-    fx, fy = (x - x0)[:, None].astype(np.float32), (y - y0)[:, None].astype(np.float32)
-    top = values[y0, x0] * (1 - fx) + values[y0, x1] * fx
-    bottom = values[y1, x0] * (1 - fx) + values[y1, x1] * fx
-    mixed: Array32 = top * (1 - fy) + bottom * fy
-    return mixed
+        found = self.network.extract(image, max_keypoints)
+        described = found.global_descriptor
+        if self.retrieval is not None:
+            described = self.retrieval.describe(image)
+        assert described is not None  # a network that gives none is not loaded without another
+        return LocalFeatures(found.keypoints, found.descriptors, found.scores, described)

@@ -1,0 +1,1 @@
+"""Feature networks side by side; see `__main__.py`."""
