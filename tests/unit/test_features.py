@@ -10,7 +10,13 @@ from tests.unit.scenes import generator
 from trigpoint.errors import ModelError
 from trigpoint.models.contract import METADATA_KEY, FeaturesContract
 from trigpoint.models.dense import sample_bilinear, select_keypoints
-from trigpoint.models.features import PROFILES, FeatureModel, find_model, packaged_model
+from trigpoint.models.features import (
+    PROFILES,
+    FeatureModel,
+    Profile,
+    find_model,
+    packaged_model,
+)
 from trigpoint.models.inputs import to_tensor
 
 
@@ -178,3 +184,19 @@ def test_a_tensor_is_normalised_as_the_contract_says(normalization: str) -> None
         ],
     }[normalization]
     np.testing.assert_allclose(tensor[0], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_profile_has_its_card_and_computes_the_same_each_time(profile: Profile) -> None:
+    path = packaged_model(profile)
+    assert path.with_name(f"{profile}.md").is_file()
+    texture = np.kron(generator("again").integers(0, 256, (40, 60)), np.ones((8, 8)))
+    image = cv2.GaussianBlur(texture.astype(np.uint8), (0, 0), 2)
+    one, two = (FeatureModel.load(profile, num_threads=n).extract(image) for n in (1, 2))
+    assert len(one) > 100
+    for name, values in vars(one).items():
+        np.testing.assert_array_equal(values, getattr(two, name))
+
+
+def test_the_box_is_small() -> None:
+    assert sum(packaged_model(profile).stat().st_size for profile in PROFILES) < 8e6
