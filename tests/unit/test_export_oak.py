@@ -16,7 +16,7 @@ from tests.unit.graphs import DIM, Graph, Shape, blobs, random
 from tests.unit.scenes import generator
 from trigpoint.errors import ConfigError, ModelError
 from trigpoint.models.contract import FeaturesContract, make_contract
-from trigpoint.models.features import FeatureModel
+from trigpoint.models.features import PROFILES, FeatureModel, Profile, packaged_model
 from trigpoint.models.session import open_network
 from trigpoint_db.cli import app
 from trigpoint_db.export_oak import export_oak
@@ -112,6 +112,14 @@ def test_a_quantised_network_becomes_float_and_keeps_its_clipping(tmp_path: Path
     before, after = run(model, standard)["desc"], run(path, image.astype(np.float32))["desc"]
     np.testing.assert_allclose(after, before, atol=0.51 * SCALE)
     assert before.min() == after.min() == 0  # where there was no ReLU, but a range
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_the_networks_in_the_box_can_be_exported(tmp_path: Path, profile: Profile) -> None:
+    config = export_oak(packaged_model(profile), tmp_path / "a.tar.xz", height=96, width=128)
+    outputs = {entry["name"]: entry["shape"] for entry in config["model"]["outputs"]}
+    assert outputs["score"] == [1, 1, 96, 128]
+    assert outputs["global"] == [1, 256]
 
 
 def test_the_same_network_gives_the_same_archive(tmp_path: Path) -> None:

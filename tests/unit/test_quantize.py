@@ -53,6 +53,7 @@ def test_a_harmless_quantisation_is_kept(images: list[Path], tmp_path: Path) -> 
     assert report.comparison.agreement.cosine > 0.98
     assert out.stat().st_size < model.stat().st_size
     assert properties(out) == properties(model)
+    onnx.checker.check_model(onnx.load(out))
     image = texture("another")
     before, after = (FeatureNetwork.load(path).extract(image, 300) for path in (model, out))
     assert compare([before], [after]).repeatability > 0.5

@@ -152,6 +152,7 @@ def _quantize(model: onnx.ModelProto, nodes: list[str], ranges: TensorsData) -> 
         extra_options={"ActivationSymmetric": False, "WeightSymmetric": True},
     )
     quantizer.quantize_model()
+    quantizer.model.topological_sort()
     quantized: onnx.ModelProto = quantizer.model.model
     return quantized
 
