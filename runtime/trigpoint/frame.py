@@ -114,6 +114,7 @@ class Statistics:
     num_consistent_anchors: int = 0  # that agree in stage 1
     num_points: int = 0  # latent points
     num_inliers: int = 0  # latent points that agree with the final pose
+    turned_deg: int = 0  # counterclockwise, of the image that the features are of
     generator: str = ""  # which hypothesis was refined: "anchor_pairs" or "latent_points"
     anchors: tuple[str, ...] = ()  # names, best first
     stage_ms: dict[str, float] = field(default_factory=dict)

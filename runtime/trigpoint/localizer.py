@@ -22,6 +22,7 @@ from trigpoint.stages import (
     average_poses,
     count_support,
     estimate_relative_poses,
+    extract_turned,
     judge,
     match_anchors,
     refine,
@@ -62,15 +63,33 @@ class Localizer:
         self.matcher = matcher or MutualNearestNeighbors()
 
     def localize(self, frame: Frame) -> Result:
-        """Estimate cam_from_world of a frame, with covariance, or say why not."""
-        options, trace = self.options, _Trace(self.clock)
+        """Estimate cam_from_world of a frame, with covariance, or say why not.
+
+        With `try_turned`, a frame that is lost as it is is also tried on its sides and upside down.
+        """
+        result = self._localize(frame, Statistics())
+        if isinstance(result, Localized) or not self.options.try_turned:
+            return result
+        if result.reason not in (Reason.FEW_MATCHES, Reason.FEW_INLIERS):
+            return result
+        for turned_deg in (90, 180, 270):
+            start = Statistics(turned_deg=turned_deg, stage_ms=result.statistics.stage_ms)
+            turned = self._localize(frame, start)
+            if isinstance(turned, Localized):
+                return turned
+        return result
+
+    def _localize(self, frame: Frame, statistics: Statistics) -> Result:
+        options, trace = self.options, _Trace(self.clock, statistics)
         if len(self.reader) == 0:
             return trace.lost(Reason.NO_MAP, "the map holds no image")
         if (contrast := float(frame.image.std())) < MIN_CONTRAST:
             return trace.lost(Reason.TOO_DARK, f"contrast {contrast:.1f} gray levels")
 
         with trace.stage("features"):
-            features = self.model.extract(frame.image, options.max_keypoints)
+            features = extract_turned(
+                self.model, frame.image, options.max_keypoints, statistics.turned_deg
+            )
         trace.note(num_features=len(features))
         if len(features) < options.min_features:
             return trace.lost(Reason.FEW_FEATURES, f"{len(features)} keypoints")
@@ -136,9 +155,9 @@ class Localizer:
 class _Trace:
     """What is known of a localization so far."""
 
-    def __init__(self, clock: Callable[[], float] | None) -> None:
+    def __init__(self, clock: Callable[[], float] | None, statistics: Statistics) -> None:
         self.clock = clock
-        self.statistics = Statistics()
+        self.statistics = statistics
 
     def note(self, **values: Any) -> None:
         self.statistics = replace(self.statistics, **values)
@@ -148,7 +167,8 @@ class _Trace:
         start = self.clock() if self.clock else 0.0
         yield
         if self.clock:
-            self.statistics.stage_ms[name] = (self.clock() - start) * 1e3
+            spent = self.statistics.stage_ms
+            spent[name] = spent.get(name, 0.0) + (self.clock() - start) * 1e3
 
     def lost(self, reason: Reason, detail: str) -> Lost:
         return Lost(reason, self.statistics, detail)

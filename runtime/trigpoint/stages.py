@@ -7,7 +7,7 @@ it and are multiplied by `Query.px`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -28,6 +28,7 @@ from trigpoint.geometry.pose_refinement import RefinedPose, refine_pose, reproje
 from trigpoint.geometry.relative_pose import estimate_relative_pose
 from trigpoint.geometry.rotation_averaging import average_rotations
 from trigpoint.geometry.triangulation import LatentPoints, Tracks, triangulate_robust
+from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import Matchable, Matcher, match_mutual
 from trigpoint.rigid import Rigid3
 
@@ -61,11 +62,14 @@ class LocalizerOptions:
     min_inlier_ratio: float = 0.4
     max_position_std_ratio: float = 0.05  # of the inliers' median depth
     max_position_std_m: float | None = None
+    try_turned: bool = False  # lost frames also on their sides and upside down
 
     def __post_init__(self) -> None:
         if self.num_anchors < 2:
             raise ConfigError("num_anchors must be at least 2: one anchor does not tell the scale")
         for name, value in vars(self).items():
+            if isinstance(value, bool):
+                continue
             if isinstance(value, int | float) and not 1e-6 < value < 1e6:
                 raise ConfigError(f"{name} must be positive and below a million, not {value}")
         if self.min_inlier_ratio > 1:
@@ -104,6 +108,21 @@ class Query:
     matches: list[Index]
     anchor_points: list[Array]
     num_matcher_failures: int
+
+
+def extract_turned(
+    model: FeatureModel, image: NDArray[np.uint8], max_keypoints: int, turned_deg: int
+) -> LocalFeatures:
+    """Extract features of an image turned counterclockwise by a multiple of 90 degrees.
+
+    The keypoints are given in px of the image as it is.
+    """
+    turns = turned_deg // 90
+    features = model.extract(np.ascontiguousarray(np.rot90(image, turns)), max_keypoints)
+    x, y = features.keypoints.T
+    right, bottom = image.shape[1] - 1, image.shape[0] - 1
+    back = ((x, y), (right - y, x), (right - x, bottom - y), (y, bottom - x))[turns]
+    return replace(features, keypoints=np.stack(back, axis=1))
 
 
 def match_anchors(

@@ -1,5 +1,6 @@
 """The map against known contents."""
 
+import gc
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -230,6 +231,7 @@ def test_a_map_renamed_into_place_is_picked_up(tmp_path: Path) -> None:
 
 def test_opening_and_refreshing_leave_no_file_open(tmp_path: Path) -> None:
     path = make_map(tmp_path / "a.tpmap", 0)
+    gc.collect()  # what other tests left open is not to be closed in between
     before = sorted(Path("/proc/self/fd").iterdir())
     with MapReader.open(path) as reader:
         for index in range(3):

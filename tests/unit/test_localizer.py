@@ -1,5 +1,6 @@
 """The pipeline on the rendered room: what is found, what is refused, and why."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from tests.conftest import Demo
 from tests.unit.scenes import generator
+from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError
@@ -156,3 +158,30 @@ def test_a_frame_of_another_size_than_its_camera_is_an_error() -> None:
 def test_settings_out_of_range_are_errors(changes: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=next(iter(changes))):
         LocalizerOptions(**changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_a_camera_on_its_side_is_found_where_asked_for(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]], turns: int
+) -> None:
+    """What an upright camera saw, turned in the image plane, is what a turned camera sees."""
+    frame, truth = flight[0]
+    fx, fy, cx, cy, k1, k2, p1, p2 = CAMERA.params
+    assert fx == fy
+    image = np.ascontiguousarray(np.rot90(frame.image, turns))
+    right, bottom = CAMERA.width - 1, CAMERA.height - 1
+    middle = ((cy, right - cx), (right - cx, bottom - cy), (bottom - cy, cx))[turns - 1]
+    c, s = ((0, -1), (-1, 0), (0, 1))[turns - 1]  # counterclockwise, and y points down
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    p2, p1 = turn[:2, :2] @ (p2, p1)  # tangential distortion is a vector
+    height, width = image.shape
+    camera = Camera("OPENCV", width, height, (fx, fy, *middle, k1, k2, p1, p2))
+    turned = Frame(image, camera)
+    assert isinstance(Localizer(model, reader).localize(turned), Lost)
+    options = LocalizerOptions(try_turned=True)
+    result = Localizer(model, reader, options, clock=time.perf_counter).localize(turned)
+    assert isinstance(result, Localized), describe(result)
+    assert result.statistics.turned_deg == 360 - 90 * turns
+    assert np.linalg.norm(result.cam_from_world.center - truth.center) < 0.02
+    R = turn @ truth.R
+    assert np.degrees(rotation_angle(result.cam_from_world.R @ R.T)) < 0.3
