@@ -52,7 +52,7 @@ class Pipeline:
         self._localizer = localizer
         self._reader = reader
         self._map_problem = ""
-        self._damage: set[str] = set()  # of the map, said once each
+        self._reported: set[str] = set()  # what is wrong with the map or a network, said once
         self._body_from_camera = body_from_camera
         self._map_frame = map_frame
 
@@ -97,8 +97,8 @@ class Pipeline:
             return self._localizer.localize(frame)
         except (DatabaseError, ModelError) as error:
             # A damaged image of the map, or a network that fails on this frame: others may do.
-            if str(error) not in self._damage:
-                self._damage.add(str(error))
+            if str(error) not in self._reported:
+                self._reported.add(str(error))
                 _log.error("%s", error)
             reason = "BAD_MAP" if isinstance(error, DatabaseError) else "BAD_NETWORK"
             return Failed(reason, str(error))
