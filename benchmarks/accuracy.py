@@ -87,7 +87,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("data", type=Path)
     parser.add_argument("--anchors", type=int, default=20)
-    parser.add_argument("--model", default="base", help="tiny, base, or a file")
+    parser.add_argument("--model", default="base", help="tiny, base, large, or a file")
     arguments = parser.parse_args()
     threadpoolctl.threadpool_limits(1, user_api="blas")
     network = FeatureModel.load(arguments.model)

@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("map", type=Path)
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--queries", type=Path, required=True)
-    parser.add_argument("--model", default="base", help="tiny, base, or a file")
+    parser.add_argument("--model", default="base", help="tiny, base, large, or a file")
     arguments = parser.parse_args()
     threadpoolctl.threadpool_limits(1, user_api="blas")
     network = FeatureModel.load(arguments.model)

@@ -18,7 +18,10 @@ STRIDE = 32  # H and W of the input are multiples of it
 
 @dataclass(frozen=True)
 class Profile:
-    """The width (channels) and depth (residual blocks) at strides 2, 4, 8, 16 and 32."""
+    """The width (channels) and depth (residual blocks) at strides 2, 4, 8, 16 and 32.
+
+    No channels at stride 2: the first layer goes to stride 4 at once.
+    """
 
     channels: tuple[int, int, int, int, int]
     blocks: tuple[int, int, int, int, int]
@@ -28,14 +31,14 @@ class Profile:
 
 
 PROFILES = {
-    "tiny": Profile((16, 16, 32, 64, 64), (0, 0, 1, 1, 1), 48, 16, 8),
+    "tiny": Profile((0, 16, 32, 64, 64), (0, 1, 1, 1, 1), 48, 16, 8),
     "base": Profile((16, 32, 64, 128, 128), (0, 1, 2, 2, 1), 80, 32),
     "large": Profile((24, 48, 96, 160, 192), (0, 2, 3, 3, 2), 160, 48),
 }
 
 
 def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    padding = {2: 0, 3: 1, 4: 1}[kernel]
+    padding = {2: 0, 3: 1, 4: 1, 8: 2}[kernel]
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=False),
         nn.BatchNorm2d(outputs),
@@ -57,6 +60,11 @@ class Residual(nn.Module):
         return F.relu(x + self.norm(self.second(self.first(x))))
 
 
+def _stage(inputs: int, outputs: int, blocks: int, kernel: int, stride: int = 2) -> nn.Sequential:
+    down = _convolution(inputs, outputs, kernel, stride)
+    return nn.Sequential(down, *(Residual(outputs) for _ in range(blocks)))
+
+
 class Network(nn.Module):
     """Image to score logits and descriptors.
 
@@ -72,13 +80,14 @@ class Network(nn.Module):
     def __init__(self, profile: Profile) -> None:
         super().__init__()
         self.profile = profile
-        c = profile.channels
-        kernels = (4, 4, 2, 2, 2)
-        inputs = (1, *c[:-1])
-        self.scales = nn.ModuleList(
-            nn.Sequential(_convolution(i, o, k, 2), *(Residual(o) for _ in range(n)))
-            for i, o, k, n in zip(inputs, c, kernels, profile.blocks, strict=True)
+        c, n = profile.channels, profile.blocks
+        first = (
+            [_stage(1, c[0], n[0], 4), _stage(c[0], c[1], n[1], 4)]
+            if c[0]
+            else [nn.Identity(), _stage(1, c[1], n[1], 8, 4)]
         )
+        others = [_stage(c[i - 1], c[i], n[i], 2) for i in range(2, 5)]
+        self.scales = nn.ModuleList(first + others)
         # Descriptors are fused at stride 8 and, but for the least profile, given at stride 4.
         f, d = profile.fusion, profile.detector
         self.fuse4 = nn.Conv2d(c[1], f, 2, 2, bias=False)

@@ -18,6 +18,7 @@ from torch.nn import functional as F
 from training.camera_effects import spoil
 from training.corpus import Picture
 from training.network import DESCRIPTOR_DIM, Network
+from training.precision import autocast
 from training.standardize import standardize
 
 NUM_WORDS = 32
@@ -68,7 +69,7 @@ def learn_head(
     with torch.no_grad():
         for place, image in _views(flat, places, rng):
             x = standardize(torch.from_numpy(image)[None, None].float())
-            with torch.autocast("cpu", torch.bfloat16):
+            with autocast(torch.device("cpu")):
                 _, fused = network.look(x)
             seen.append(head.describe(fused.float()).half())
             owners.append(place)

@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from training.precision import autocast
+
 STRIDE = 4  # of the descriptors kept
 ALIKE_WEIGHT = 0.85  # of its similarity, beside 1 for EdgePoint2's
 NUM_WARPS = 6
@@ -54,7 +56,7 @@ class Teachers:
         x = self._tensor(image)
         edgepoint2, _ = self.edgepoint2(x)
         color = x.expand(-1, 3, -1, -1).contiguous(memory_format=torch.channels_last)
-        with torch.autocast(self.device.type, torch.bfloat16):
+        with autocast(self.device):
             _, alike = self.alike(color)
         alike = F.avg_pool2d(F.normalize(alike.float(), dim=1), STRIDE)
         joined = torch.cat(

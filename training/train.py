@@ -24,14 +24,17 @@ from training.corpus import collect_taught, make_corpus
 from training.curve import draw_curve
 from training.losses import WEIGHTS, Losses, Projection
 from training.network import PROFILES, Network, grow
+from training.optimizer import Muon
 from training.pairs import Pairs
+from training.precision import autocast
 from training.standardize import standardize
 from training.teachers import Teachers
 from training.validation import Validation
 
-WARM_UP_STEPS = 200
-LAST_RATE = 0.02  # of the learning rate
-LOG_EVERY, CHECKPOINT_EVERY, VALIDATE_EVERY = 50, 500, 1000
+WARM_UP_STEPS = 100
+LAST_RATE = 0.02  # of the highest
+OTHERS_RATE = 2e-3  # of what is no convolution's weight
+LOG_EVERY, CHECKPOINT_EVERY, VALIDATE_EVERY = 50, 250, 500
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -49,9 +52,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         grow(network, torch.load(arguments.grow_from, "cpu")["network"])
     network.to(device, memory_format=torch.channels_last)
     losses.to(device)
-    optimizer = torch.optim.AdamW(
-        parameter_groups(network, losses), lr=arguments.rate, betas=(0.9, 0.98)
-    )
+    optimizers = make_optimizers(network, losses, arguments.rate)
     arguments.out.mkdir(parents=True, exist_ok=True)
     checkpoint = arguments.out / "checkpoint.pt"
     start = 0
@@ -61,7 +62,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             raise SystemExit(f"{checkpoint} is of another profile; name another folder with --out")
         network.load_state_dict(state["network"])
         losses.load_state_dict(state["losses"])
-        optimizer.load_state_dict(state["optimizer"])
+        for optimizer, kept in zip(optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(kept)
         start = state["step"]
     batches = loader(Pairs(arguments.corpus, arguments.pairs, arguments.seed), start, arguments)
     validation = Validation(arguments.photographs, device)
@@ -69,16 +71,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     keep_log(log, start)
     sums: dict[str, float] = {}
     for step, batch in enumerate(batches, start + 1):
-        set_rate(optimizer, arguments.rate, step, arguments.steps)
+        set_rates(optimizers, step, arguments.steps)
         batch = batch.to(device)
-        with torch.autocast(device.type, torch.bfloat16):
+        with autocast(device):
             scores, descriptors = network(standardize(batch.images.float()))
         parts = losses(scores, descriptors, batch)
         loss = sum(weight * parts[name] for name, weight in WEIGHTS.items())
-        optimizer.zero_grad()
+        network.zero_grad()
+        losses.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-        optimizer.step()
+        for optimizer in optimizers:
+            optimizer.step()
         for name, value in parts.items():
             sums[name] = sums.get(name, 0.0) + value.item() / LOG_EVERY
         if step % LOG_EVERY == 0:
@@ -93,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 "profile": dataclasses.asdict(PROFILES[arguments.profile]),
                 "network": network.state_dict(),
                 "losses": losses.state_dict(),
-                "optimizer": optimizer.state_dict(),
+                "optimizers": [optimizer.state_dict() for optimizer in optimizers],
                 "step": step,
                 "seed": arguments.seed,
             }
@@ -109,9 +113,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     for name in ("photographs", "edgepoint2", "alike", "corpus", "out"):
         parser.add_argument(f"--{name}", type=Path, required=True)
     parser.add_argument("--grow-from", type=Path)
-    parser.add_argument("--steps", type=int, default=14_000)
+    parser.add_argument("--steps", type=int, default=6_000)
     parser.add_argument("--pairs", type=int, default=8, help="pairs a step")
-    parser.add_argument("--rate", type=float, default=2e-3, help="learning rate")
+    parser.add_argument("--rate", type=float, default=1.8e-2, help="learning rate, at its highest")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1)
@@ -143,22 +147,27 @@ def single_thread(_: int) -> None:
     torch.set_num_threads(1)
 
 
-def parameter_groups(network: Network, losses: Losses) -> list[dict[str, object]]:
-    """Decay weights, but no biases, norms or the scale."""
+def make_optimizers(network: Network, losses: Losses, rate: float) -> list[torch.optim.Optimizer]:
+    """Muon for the convolutions; AdamW for biases, norms and the scale, which do not decay."""
     weights = [p for p in network.parameters() if p.ndim > 1]
     others = [p for p in network.parameters() if p.ndim <= 1] + list(losses.parameters())
-    return [
-        {"params": weights, "weight_decay": 0.01},
-        {"params": others, "weight_decay": 0.0},
+    optimizers = [
+        Muon(weights, rate),
+        torch.optim.AdamW(others, OTHERS_RATE, betas=(0.9, 0.98), weight_decay=0.0),
     ]
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            group["highest_lr"] = group["lr"]
+    return optimizers
 
 
-def set_rate(optimizer: torch.optim.Optimizer, rate: float, step: int, steps: int) -> None:
+def set_rates(optimizers: Sequence[torch.optim.Optimizer], step: int, steps: int) -> None:
     """Warm up, then fall along a cosine."""
     cosine = 0.5 * (1 + math.cos(math.pi * step / steps))
-    now = rate * min(1.0, step / WARM_UP_STEPS) * (LAST_RATE + (1 - LAST_RATE) * cosine)
-    for group in optimizer.param_groups:
-        group["lr"] = now
+    share = min(1.0, step / WARM_UP_STEPS) * (LAST_RATE + (1 - LAST_RATE) * cosine)
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            group["lr"] = group["highest_lr"] * share
 
 
 def keep_log(log: Path, step: int) -> None:

@@ -74,7 +74,7 @@ def replay(
         Path | None, typer.Option(help="Write `time_ns qw qx qy qz tx ty tz`, cam_from_world.")
     ] = None,
     topic: Annotated[str | None, typer.Option(help="The images' topic.")] = None,
-    model: Annotated[str, typer.Option(help="tiny, base, or a file (.onnx).")] = "base",
+    model: Annotated[str, typer.Option(help="tiny, base, large, or a file (.onnx).")] = "base",
     retrieval: Annotated[
         Path | None, typer.Option(help="A retrieval network, where the other needs one.")
     ] = None,

@@ -68,7 +68,7 @@ class ModelConfig(Section):
     @classmethod
     def _named(cls, network: object) -> object:
         if not isinstance(network, str | Path):
-            raise ValueError("must be 'tiny', 'base' or a file")  # noqa: TRY004
+            raise ValueError("must be 'tiny', 'base', 'large' or a file")  # noqa: TRY004
         return network
 
 

@@ -48,7 +48,7 @@ app = typer.Typer(
 )
 console = Console()
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
-Model = Annotated[str, typer.Option(help="The network: tiny, base, or a file (.onnx).")]
+Model = Annotated[str, typer.Option(help="The network: tiny, base, large, or a file (.onnx).")]
 Retrieval = Annotated[
     Path | None, typer.Option(help="A retrieval network, where the other needs one beside it.")
 ]
@@ -367,7 +367,7 @@ def quantize_command(
 
 @app.command("export-oak")
 def export_oak_command(
-    model: Annotated[str, typer.Argument(help="tiny, base, or a file (.onnx).")],
+    model: Annotated[str, typer.Argument(help="tiny, base, large, or a file (.onnx).")],
     out: Annotated[Path, typer.Argument(metavar="OUT.tar.xz", help="The archive.")],
     height: Annotated[int, typer.Option(help="Of the image on the device.", min=1)] = 480,
     width: Annotated[int, typer.Option(help="Of the image on the device.", min=1)] = 640,

@@ -12,6 +12,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from tests.unit.graphs import Graph
 from tests.unit.scenes import generator
 from tests.unit.small_network import texture, write_network
 from trigpoint.errors import TrigpointError
@@ -26,7 +27,7 @@ from trigpoint_db.quantize import (
 )
 from trigpoint_db.quantize.accuracy import Agreement, compare
 from trigpoint_db.quantize.calibration import Distribution
-from trigpoint_db.quantize.graph import FloatNetwork
+from trigpoint_db.quantize.graph import FloatNetwork, open_session
 from trigpoint_db.quantize.network import make_input
 
 # Few pairs are noisy; the networks here either lose next to nothing or everything.
@@ -171,6 +172,23 @@ def test_a_batch_norm_is_folded_into_its_convolution(tmp_path: Path) -> None:
     (tmp_path / "folded.onnx").write_bytes(folded.SerializeToString())
     both = [FeatureNetwork.load(p).extract(texture("b")) for p in (path, tmp_path / "folded.onnx")]
     np.testing.assert_allclose(both[0].scores, both[1].scores, atol=1e-4)
+
+
+def test_integer_sums_do_not_overflow_on_any_processor(tmp_path: Path) -> None:
+    graph = Graph(image=[1, 8, 16, 16])
+    weights = np.ones((4, 8, 3, 3))
+    path = graph.save(
+        tmp_path / "m.onnx",
+        {"sums": (graph.add("Conv", "image", graph.constant(weights)), [1, 4, 14, 14])},
+    )
+    image = generator("overflow").uniform(0.8, 1.0, (1, 8, 16, 16)).astype(np.float32)
+    network = FloatNetwork(path, [{"image": image}])
+    quantized = network.quantize(network.groups, 100.0)
+    exact, fast = (  # in float, and by the integer kernels of the processor at hand
+        open_session(quantized, optimized=optimized).run(None, {"image": image})[0]
+        for optimized in (False, True)
+    )
+    np.testing.assert_allclose(fast, exact, atol=exact.max() / 100)
 
 
 def refused(model: Path, images: list[Path], **more: Path) -> str:

@@ -16,7 +16,7 @@ from trigpoint.models.local import FeatureNetwork
 from trigpoint.models.retrieval import RetrievalModel
 from trigpoint.models.session import hash_files
 
-Profile = Literal["tiny", "base"]
+Profile = Literal["tiny", "base", "large"]
 PROFILES: tuple[Profile, ...] = get_args(Profile)
 
 
@@ -53,7 +53,7 @@ class FeatureModel:
         Parameters
         ----------
         name : str or Path
-            A profile in the box ("tiny", "base"), or a file.
+            A profile in the box ("tiny", "base", "large"), or a file.
         retrieval : Path, optional
             A network for the global descriptor; needed where the other gives none.
         num_threads : int
