@@ -41,6 +41,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     arguments = parse(argv)
     torch.set_num_threads(arguments.threads)
+    cv2.setNumThreads(arguments.threads)
     torch.manual_seed(arguments.seed)
     device = torch.device(arguments.device)
     if not (arguments.corpus / "complete").exists():
