@@ -28,11 +28,12 @@ class Profile:
     fusion: int  # channels in which the scales are summed for the descriptors
     detector: int  # and for the scores
     descriptor_stride: int = 4
+    words: int = 32  # of the global descriptor
 
 
 PROFILES = {
     "tiny": Profile((0, 16, 32, 64, 64), (0, 1, 1, 1, 1), 48, 16, 8),
-    "base": Profile((16, 32, 64, 128, 128), (0, 1, 2, 2, 1), 80, 32),
+    "base": Profile((16, 32, 64, 128, 128), (0, 1, 2, 2, 1), 80, 32, words=64),
     "large": Profile((24, 48, 96, 160, 192), (0, 2, 3, 3, 2), 160, 48),
 }
 

@@ -21,7 +21,6 @@ from training.network import DESCRIPTOR_DIM, Network
 from training.precision import autocast
 from training.standardize import standardize
 
-NUM_WORDS = 32
 GLOBAL_DIM = 256
 VIEW = (384, 288)  # width, height of the pictures learnt from
 VIEWS_OF_FLAT = 2
@@ -36,17 +35,18 @@ class GlobalHead(nn.Module):
 
     def __init__(self, network: Network) -> None:
         super().__init__()
+        words = network.profile.words
         self.desc = network.mean_desc()
-        self.assign = nn.Linear(DESCRIPTOR_DIM, NUM_WORDS)
-        self.words = nn.Parameter(torch.zeros(NUM_WORDS, DESCRIPTOR_DIM))
-        self.whiten = nn.Linear(NUM_WORDS * DESCRIPTOR_DIM, GLOBAL_DIM)
+        self.assign = nn.Linear(DESCRIPTOR_DIM, words)
+        self.words = nn.Parameter(torch.zeros(words, DESCRIPTOR_DIM))
+        self.whiten = nn.Linear(words * DESCRIPTOR_DIM, GLOBAL_DIM)
 
     def describe(self, fused: Tensor) -> Tensor:
         """Return the descriptors of all cells (B, h w, 64), unit length."""
         return F.normalize(self.desc(fused).flatten(2).transpose(1, 2), dim=2)
 
     def vlad(self, cells: Tensor) -> Tensor:
-        """Sum the residuals of (B, N, 64) to the words: (B, NUM_WORDS * 64), normalised."""
+        """Sum the residuals of (B, N, 64) to the words: (B, 64 words), normalised."""
         # A sixty-fourth of the sums, so that 16-bit floats hold their squares.
         share = self.assign(cells).softmax(dim=2).transpose(1, 2) / 64
         sums = share @ cells - share.sum(dim=2, keepdim=True) * self.words
@@ -110,7 +110,7 @@ def _set_words(head: GlobalHead, cells: NDArray[np.float32]) -> None:
     cv2.setRNGSeed(1)
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
     sample = np.ascontiguousarray(cells[:: max(1, len(cells) // 60_000)])
-    _, _, words = cv2.kmeans(sample, NUM_WORDS, None, criteria, 1, cv2.KMEANS_PP_CENTERS)
+    _, _, words = cv2.kmeans(sample, len(head.words), None, criteria, 1, cv2.KMEANS_PP_CENTERS)
     squared = np.sort((words**2).sum(axis=1) - 2 * sample @ words.T, axis=1)
     sharpness = np.log(100) / np.mean(squared[:, 1] - squared[:, 0])
     centers = torch.from_numpy(words)
