@@ -95,7 +95,9 @@ class Localizer:
             return trace.lost(Reason.FEW_FEATURES, f"{len(features)} keypoints")
 
         with trace.stage("retrieval"):
-            indices, _ = self.reader.search(features.global_descriptor, options.num_anchors)
+            indices, _ = self.reader.search(
+                features.global_descriptor, options.num_anchors, options.anchor_diversity
+            )
             anchors = [self.reader.anchor(int(index)) for index in indices]
         trace.note(num_anchors=len(anchors), anchors=tuple(anchor.name for anchor in anchors))
 

@@ -41,6 +41,7 @@ class LocalizerOptions:
     """Settings of the localizer; pixels are those of the image as the network sees it."""
 
     num_anchors: int = 20
+    anchor_diversity: float = 0.3  # of the likeness to a better anchor, taken off; see search
     max_keypoints: int = 1024
     # "best": latent points first; anchor pairs too where these have few supporters
     generator: Literal["best", "anchor_pairs", "latent_points"] = "best"
@@ -68,10 +69,12 @@ class LocalizerOptions:
         if self.num_anchors < 2:
             raise ConfigError("num_anchors must be at least 2: one anchor does not tell the scale")
         for name, value in vars(self).items():
-            if isinstance(value, bool):
+            if isinstance(value, bool) or name == "anchor_diversity":
                 continue
             if isinstance(value, int | float) and not 1e-6 < value < 1e6:
                 raise ConfigError(f"{name} must be positive and below a million, not {value}")
+        if not 0 <= self.anchor_diversity <= 1:
+            raise ConfigError(f"anchor_diversity must be 0 to 1, not {self.anchor_diversity}")
         if self.min_inlier_ratio > 1:
             raise ConfigError(f"min_inlier_ratio must be at most 1, not {self.min_inlier_ratio}")
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tests.unit.maps import MODEL, add, make_features, make_map, make_pose, require_image
 from trigpoint.camera import PARAMETERS, Camera
 from trigpoint.database import schema
+from trigpoint.database.ranking import POOL
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import DatabaseError
@@ -175,6 +176,46 @@ def test_search_equals_brute_force_on_the_stored_rows(
     assert len(indices) == len(set(indices.tolist())) == min(k, 300)
     np.testing.assert_allclose(similarities, best, atol=1e-6)
     np.testing.assert_allclose(expected[indices], best, atol=1e-6)
+
+
+def test_a_diverse_search_passes_over_what_looks_like_a_better_image(tmp_path: Path) -> None:
+    """Thirty near copies of a wrong view, which look most like the query, hide the right one."""
+    query, wrong, right = np.eye(32, dtype=np.float32)[:3]
+    rng = np.random.default_rng(0)
+    with MapWriter.create(tmp_path / "a.tpmap", MODEL) as writer:
+        for index in range(31):
+            view = 0.6 * query + 0.8 * wrong if index < 30 else 0.5 * query + 0.87 * right
+            row = view + rng.normal(0, 0.01, 32).astype(np.float32)
+            features = replace(make_features(index), global_descriptor=row / np.linalg.norm(row))
+            add(writer, index, features=features)
+    with MapReader.open(tmp_path / "a.tpmap") as reader:
+        assert 30 not in reader.search(query, 10)[0]
+        found, similarities = reader.search(query, 10, diversity=0.3)
+        everything = reader.search(query, 31)[0]
+    assert found[:2].tolist() == [everything[0], 30]
+    assert similarities[1] < similarities[2]
+
+
+@settings(max_examples=25, deadline=None)
+@given(k=st.integers(1, 40), diversity=st.floats(0.01, 1), seed=st.integers(0, 99))
+def test_a_diverse_search_is_the_greedy_choice(
+    tmp_path_factory: pytest.TempPathFactory, k: int, diversity: float, seed: int
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "diverse.tpmap"
+    if not path.exists():
+        make_map(path, 300)
+    query = make_features(seed).global_descriptor
+    with MapReader.open(path) as reader:
+        pool, likeness = reader.search(query, POOL * k)
+        found, _ = reader.search(query, k, diversity)
+    stored = [schema.quantize_row(make_features(i).global_descriptor) for i in pool.tolist()]
+    rows = np.array([scale * row.astype(np.float64) for scale, row in stored])
+    chosen: list[int] = []
+    while len(chosen) < min(k, 300):
+        nearest = (rows @ rows[chosen].T).max(axis=1, initial=0.0)
+        scores = likeness - diversity * nearest
+        chosen.append(next(i for i in np.argsort(-scores, kind="stable") if i not in chosen))
+    assert found.tolist() == pool[chosen].tolist()
 
 
 def test_equally_similar_images_come_in_the_order_they_were_added(tmp_path: Path) -> None:

@@ -153,7 +153,8 @@ def test_a_frame_of_another_size_than_its_camera_is_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"num_anchors": 1}, {"min_inliers": 0}, {"min_inlier_ratio": 40}]
+    "changes",
+    [{"num_anchors": 1}, {"min_inliers": 0}, {"min_inlier_ratio": 40}, {"anchor_diversity": -1}],
 )
 def test_settings_out_of_range_are_errors(changes: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=next(iter(changes))):

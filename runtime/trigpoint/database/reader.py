@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from trigpoint.database import schema
 from trigpoint.database.pages import DamageError
+from trigpoint.database.ranking import POOL, choose_diverse, find_largest
 from trigpoint.database.snapshot import Snapshot, reporting
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import Anchor, ModelIdentity
@@ -85,8 +86,13 @@ class MapReader:
             )
         return Anchor(image.name, image.camera, image.cam_from_world, keypoints, descriptors)
 
-    def search(self, global_descriptor: Array32, k: int) -> tuple[NDArray[np.intp], Array32]:
+    def search(
+        self, global_descriptor: Array32, k: int, diversity: float = 0.0
+    ) -> tuple[NDArray[np.intp], Array32]:
         """Find the images that look most alike, by comparing with all.
+
+        Where many images show the same view, and look like the query by accident, they would leave
+        no place for the one that is right: `choose_diverse` prefers others.
 
         Parameters
         ----------
@@ -94,11 +100,13 @@ class MapReader:
             L2-normalised.
         k : int
             How many, at the most.
+        diversity : float
+            See `choose_diverse`; the choice is among the `POOL` k most similar images.
 
         Returns
         -------
         indices : (k,) int
-            Most similar first; equally similar ones by index.
+            Best first: without diversity the most similar, equally similar ones by index.
         similarities : (k,) float32
             Cosines.
         """
@@ -114,7 +122,11 @@ class MapReader:
                 part = similarities[start : start + schema.BLOCK_ROWS]
                 scales, rows = _rows(snapshot, block)
                 np.multiply(rows.astype(np.float32) @ global_descriptor, scales, out=part)
-        return _largest(similarities, k)
+            best = find_largest(similarities, k if diversity == 0 else POOL * k)
+            if diversity > 0:
+                alike = _descriptors(snapshot, best)
+                best = best[choose_diverse(similarities[best], alike @ alike.T, k, diversity)]
+        return best, similarities[best]
 
     def refresh(self) -> bool:
         """Move to the newest snapshot, also of another file renamed into place; True if it differs.
@@ -188,11 +200,13 @@ def _rows(snapshot: Snapshot, block: int) -> tuple[Array32, NDArray[np.int8]]:
     return scales, rows
 
 
-def _largest(values: Array32, k: int) -> tuple[NDArray[np.intp], Array32]:
-    """Return where the k largest lie, largest first, equal ones in order; and these."""
-    k = min(k, len(values))
-    if k < 1:
-        return np.empty(0, np.intp), np.empty(0, np.float32)
-    candidates = np.flatnonzero(values >= np.partition(values, -k)[-k])
-    best = candidates[np.argsort(-values[candidates], kind="stable")[:k]]
-    return best, values[best]
+def _descriptors(snapshot: Snapshot, indices: NDArray[np.intp]) -> Array32:
+    """Return the global descriptors of some images (K, G)."""
+    descriptors = np.empty((len(indices), snapshot.metadata.model.global_dim), np.float32)
+    block_of = indices // schema.BLOCK_ROWS
+    for block in np.unique(block_of):
+        scales, rows = _rows(snapshot, int(block))
+        here = block_of == block
+        inside = indices[here] % schema.BLOCK_ROWS
+        descriptors[here] = rows[inside] * scales[inside, None]
+    return descriptors
