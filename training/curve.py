@@ -15,6 +15,8 @@ def draw_curve(log: Path, out: Path) -> None:
     """Draw every quantity of the log, one JSON object a line, against the step."""
     records = [json.loads(line) for line in log.read_text().splitlines()]
     names = [name for name in dict.fromkeys(key for r in records for key in r) if name != "step"]
+    if not names:  # a run too short to have logged
+        return
     figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(4 * -(-len(names) // 2), 6))
     for axis, name in zip(axes.flat, names, strict=False):
         points = [(r["step"], r[name]) for r in records if name in r]
