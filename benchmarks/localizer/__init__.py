@@ -1,0 +1,1 @@
+"""The localizer against hloc, and against its own claims."""
