@@ -24,6 +24,7 @@ from trigpoint.geometry.center_averaging import (
     center_directions,
 )
 from trigpoint.geometry.epipolar import essential_matrix, sampson_error
+from trigpoint.geometry.joint_refinement import PoseNoise, refine_jointly
 from trigpoint.geometry.pose_refinement import RefinedPose, refine_pose, reprojection
 from trigpoint.geometry.relative_pose import estimate_relative_pose
 from trigpoint.geometry.rotation_averaging import average_rotations
@@ -57,7 +58,10 @@ class LocalizerOptions:
     max_guided_error_px: float = 2.0
     max_ray_error_px: float = 2.0
     max_reprojection_error_px: float = 4.0
-    keypoint_sigma_px: float = 0.4
+    keypoint_sigma_px: float = 0.5
+    num_refined_anchors: int = 8  # those with the most guided matches
+    map_position_noise: float = 0.003  # of the distance between two cameras of the map
+    map_rotation_noise_deg: float = 0.02
     min_features: int = 50
     min_inliers: int = 30
     min_inlier_ratio: float = 0.4
@@ -277,8 +281,11 @@ def guide_matches(query: Query, cam_from_world: Rigid3, max_error_px: float) -> 
 def refine(
     query: Query, cam_from_world: Rigid3, options: LocalizerOptions
 ) -> tuple[LatentPoints, RefinedPose | None]:
-    """Stage 2 of the paper: guided matches, latent points (E1), pose (E2)."""
+    """Stage 2 of the paper: guided matches, latent points (E1), pose (E2); then all together."""
     tracks = guide_matches(query, cam_from_world, options.max_guided_error_px)
+    num_matches = np.bincount(tracks.view, minlength=len(query.views))
+    chosen = np.argsort(-num_matches, kind="stable")[: options.num_refined_anchors]
+    tracks = tracks[np.isin(tracks.view, chosen)]
     latent = triangulate_robust(query.views, tracks, max_error_px=options.max_ray_error_px)
     if len(latent.point) == 0:
         return latent, None
@@ -290,6 +297,21 @@ def refine(
         point_covariance=latent.covariance / query.px**2,
         sigma=options.keypoint_sigma_px * query.px,
         max_error=options.max_reprojection_error_px * query.px,
+    )
+    if refined is None:
+        return latent, None
+    view = np.searchsorted(chosen := np.sort(chosen), latent.tracks.view)
+    refined = refine_jointly(
+        refined.cam_from_world,
+        query.views[chosen],
+        replace(latent, tracks=replace(latent.tracks, view=view)),
+        query.points[latent.point],
+        px=query.px,
+        sigma_px=options.keypoint_sigma_px,
+        pose_noise=PoseNoise(
+            options.map_position_noise, np.deg2rad(options.map_rotation_noise_deg)
+        ),
+        max_error_px=options.max_reprojection_error_px,
     )
     return latent, refined
 

@@ -37,11 +37,12 @@ class RefinedPose:
 def reprojection(
     cam_from_world: Rigid3, points3d: Array, points2d: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Residuals of the query's points and their Jacobians.
+    """Residuals of image points and their Jacobians.
 
     Parameters
     ----------
     cam_from_world : Rigid3
+        Of one camera, or of each point's (M,).
     points3d : (M, 3) float64
     points2d : (M, 2) float64
         Normalised image points.
@@ -58,19 +59,19 @@ def reprojection(
     """
     R = cam_from_world.R
     from_center = points3d - cam_from_world.center
-    Y = from_center @ R.T
+    Y = rotate(R, from_center)
     in_front = Y[:, 2] > 0
     z = np.where(in_front, Y[:, 2], 1.0)
     xy = Y[:, :2] / z[:, None]
-    by_point = (R[None, :2] - xy[:, :, None] * R[None, 2:]) / z[:, None, None]
+    by_point = (R[..., :2, :] - xy[:, :, None] * R[..., 2:, :]) / z[:, None, None]
     by_pose = np.concatenate([-by_point, by_point @ skew(from_center)], axis=2)
     return xy - points2d, by_pose, by_point, in_front
 
 
 def perturb(cam_from_world: Rigid3, delta: Array) -> Rigid3:
-    """Apply an error (dc, dtheta) (6,): center c + dc, rotation R exp(-dtheta)."""
-    R = cam_from_world.R @ rotation_from_vector(-delta[3:])
-    return Rigid3.from_center(R, cam_from_world.center + delta[:3])
+    """Apply errors (dc, dtheta) (..., 6): center c + dc, rotation R exp(-dtheta)."""
+    R = cam_from_world.R @ rotation_from_vector(-delta[..., 3:])
+    return Rigid3.from_center(R, cam_from_world.center + delta[..., :3])
 
 
 def refine_pose(
@@ -114,7 +115,7 @@ def refine_pose(
 
     def evaluate(pose: Rigid3) -> tuple[float, Array, Array, Array, NDArray[np.bool_]]:
         r, J, by_point, in_front = reprojection(pose, points3d, points2d)
-        whiten = _inverse_cholesky(
+        whiten = inverse_cholesky(
             np.eye(2) + by_point @ point_covariance @ np.swapaxes(by_point, 1, 2)
         )
         distance = np.sqrt((r**2).sum(axis=1))
@@ -131,7 +132,7 @@ def refine_pose(
         weight = np.where(inliers, 1 / (1 + square / CAUCHY**2), 0.0)
         H = np.einsum("m,mki,mkj->ij", weight, J, J, optimize=True)
         g = np.einsum("m,mki,mk->i", weight, J, r, optimize=True)
-        if inliers.sum() < MIN_POINTS or not _is_determined(H):
+        if inliers.sum() < MIN_POINTS or not is_determined(H):
             return None
         step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
         candidate = perturb(cam_from_world, step)
@@ -155,7 +156,7 @@ def _with_covariance(
     """Add the covariance: inverse information of the weighted points times the residuals' scale."""
     weight = np.where(inliers, 1 / (1 + square / CAUCHY**2), 0.0)
     H = np.einsum("m,mki,mkj->ij", weight, J, J, optimize=True)
-    if inliers.sum() < MIN_POINTS or not _is_determined(H):
+    if inliers.sum() < MIN_POINTS or not is_determined(H):
         return None
     dof = max(2 * weight.sum() - 6, 0.0)
     variance = (float((weight * square).sum()) + PRIOR_DOF) / (dof + PRIOR_DOF)
@@ -163,13 +164,13 @@ def _with_covariance(
     return RefinedPose(cam_from_world, (covariance + covariance.T) / 2, inliers)
 
 
-def _is_determined(H: Array) -> bool:
+def is_determined(H: Array) -> bool:
     """Say whether the normal matrix is regular, whatever the unit of length is."""
     scale = np.sqrt(np.diag(H))
     return bool((scale > 0).all() and np.linalg.cond(H / np.outer(scale, scale)) < 1e12)
 
 
-def _inverse_cholesky(S: Array) -> Array:
+def inverse_cholesky(S: Array) -> Array:
     """Whitening matrices W (M, 2, 2) with W S W^T = I, in closed form."""
     a, b, c = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
     l11 = np.sqrt(a)
