@@ -156,8 +156,8 @@ class _System:
         return self.inliers.sum() >= MIN_POINTS and is_determined(self.information[-6:, -6:])
 
     def step(self, state: _State) -> _State:
-        normal = self.information + self._prior()
-        step: Array = np.linalg.solve(normal, -self.gradient[:, None])[:, 0]
+        step = -np.linalg.solve(self.information + self._prior(), self.gradient)
+        step = step.astype(np.float64, copy=False)
         return _State(
             perturb(state.cam_from_world, step[-6:]),
             state.errors + step[:-6].reshape(-1, 6),
@@ -166,11 +166,11 @@ class _System:
 
     def covariance(self) -> Array:
         inverse = np.linalg.inv(self.information / self.variance + self._prior())
-        query: Array = inverse[-6:, -6:]
+        query = inverse[-6:, -6:].astype(np.float64, copy=False)
         return (query + query.T) / 2
 
     def _prior(self) -> Array:
-        return np.diag(np.r_[np.ones(len(self.gradient) - 6), np.zeros(6)])
+        return np.diag(np.repeat([1.0, 0.0], [len(self.gradient) - 6, 6]))
 
 
 @dataclass(frozen=True, eq=False)
