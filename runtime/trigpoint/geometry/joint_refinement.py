@@ -156,8 +156,8 @@ class _System:
         return self.inliers.sum() >= MIN_POINTS and is_determined(self.information[-6:, -6:])
 
     def step(self, state: _State) -> _State:
-        step = -np.linalg.solve(self.information + self._prior(), self.gradient)
-        step = step.astype(np.float64, copy=False)
+        normal = self.information + self._prior()
+        step = np.linalg.solve(normal, -self.gradient).astype(np.float64, copy=False)
         return _State(
             perturb(state.cam_from_world, step[-6:]),
             state.errors + step[:-6].reshape(-1, 6),
