@@ -18,7 +18,7 @@ from trigpoint.database.reader import MapReader
 from trigpoint.frame import Anchor, Localized
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
-from trigpoint.models.matching import match_mutual
+from trigpoint.models.matching import Matchable, MutualNearestNeighbors
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint.stages import LocalizerOptions
 from trigpoint_db.build import build_map, read_frame, select_images
@@ -71,7 +71,10 @@ def compare(
                 features, ms_features = timed(network.extract, frame.image, options.max_keypoints)
                 stage_ms = {"features": ms_features, "retrieval": stage_ms["retrieval"]}
                 matches, stage_ms["matching"] = timed(
-                    match_query, features.descriptors, anchors, result.statistics.anchors
+                    match_query,
+                    Matchable.of(features, query.camera),
+                    anchors,
+                    result.statistics.anchors,
                 )
                 files = scratch / "query.h5", scratch / "query_matches.h5"
                 write_keypoints(files[0], {query.name: features.keypoints})
@@ -103,8 +106,10 @@ def errors(estimate: Rigid3 | None, truth: Rigid3) -> tuple[float, float]:
 def match_map(anchors: dict[str, Anchor]) -> dict[tuple[str, str], NDArray[np.intp]]:
     """Match all anchors, and keep each one's matches with its best neighbours."""
     names = list(anchors)
+    matcher = MutualNearestNeighbors()
+    matchable = {name: Matchable.of(anchor, anchor.camera) for name, anchor in anchors.items()}
     matches = {
-        (a, b): match_mutual(anchors[a].descriptors, anchors[b].descriptors)[0]
+        (a, b): matcher.match(matchable[a], matchable[b])[0]
         for a, b in itertools.combinations(names, 2)
     }
     kept = set()
@@ -115,7 +120,11 @@ def match_map(anchors: dict[str, Anchor]) -> dict[tuple[str, str], NDArray[np.in
 
 
 def match_query(
-    descriptors: NDArray[np.float32], anchors: dict[str, Anchor], retrieved: Sequence[str]
+    query: Matchable, anchors: dict[str, Anchor], retrieved: Sequence[str]
 ) -> dict[str, NDArray[np.intp]]:
     """Match a query with the anchors retrieved for it."""
-    return {a: match_mutual(descriptors, anchors[a].descriptors)[0] for a in retrieved}
+    matcher = MutualNearestNeighbors()
+    return {
+        name: matcher.match(query, Matchable.of(anchors[name], anchors[name].camera))[0]
+        for name in retrieved
+    }

@@ -87,7 +87,26 @@ class Anchor:
     camera: Camera
     cam_from_world: Rigid3
     keypoints: NDArray[np.float32]  # (N, 2) px
-    descriptors: NDArray[np.float32]  # (N, D), L2-normalised
+    descriptors: NDArray[np.int8]  # (N, D), as `quantize_descriptors` makes them
+
+
+def quantize_descriptors(descriptors: NDArray[np.float32], levels: int = 127) -> NDArray[np.int8]:
+    """Round L2-normalised descriptors (N, D) to integers up to `levels`.
+
+    They reach to 4 / sqrt(D), four times the mean square of a unit vector's numbers, for all
+    descriptors alike: their products compare as those of the descriptors do.
+    """
+    scale = np.float32(levels * np.sqrt(descriptors.shape[1]) / 4)
+    codes: NDArray[np.int8] = np.clip(np.rint(descriptors * scale), -levels, levels).astype(np.int8)
+    return codes
+
+
+def restore_descriptors(codes: NDArray[np.int8]) -> NDArray[np.float32]:
+    """L2-normalise quantized descriptors (N, D); zero stays zero."""
+    descriptors = codes.astype(np.float32)
+    norms = np.sqrt(np.einsum("ij,ij->i", descriptors, descriptors))
+    descriptors /= np.maximum(norms, np.float32(1))[:, None]
+    return descriptors
 
 
 class Reason(StrEnum):

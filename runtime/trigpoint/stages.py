@@ -30,7 +30,7 @@ from trigpoint.geometry.relative_pose import estimate_relative_pose
 from trigpoint.geometry.rotation_averaging import average_rotations
 from trigpoint.geometry.triangulation import LatentPoints, Tracks, triangulate_robust
 from trigpoint.models.features import FeatureModel
-from trigpoint.models.matching import Matchable, Matcher, match_mutual
+from trigpoint.models.matching import Matchable, Matcher, MutualNearestNeighbors
 from trigpoint.rigid import Rigid3
 
 Array = NDArray[np.float64]
@@ -145,12 +145,14 @@ def match_anchors(
     matches: list[Index] = []
     anchor_points: list[Array] = []
     num_failures = 0
-    query = _matchable(features, frame.camera)
+    query = Matchable.of(features, frame.camera)
+    fallback = MutualNearestNeighbors()
     for anchor in anchors:
+        other = Matchable.of(anchor, anchor.camera)
         try:
-            pairs, _ = matcher.match(query, _matchable(anchor, anchor.camera))
+            pairs, _ = matcher.match(query, other)
         except ModelError:  # a network that does not run on these features: do without
-            pairs, _ = match_mutual(features.descriptors, anchor.descriptors)
+            pairs, _ = fallback.match(query, other)
             num_failures += 1
         xy = anchor.camera.normalize(anchor.keypoints[pairs[:, 1]])
         usable = seen[pairs[:, 0]] & np.isfinite(xy).all(axis=1)
@@ -172,10 +174,6 @@ def match_anchors(
         anchor_points,
         num_failures,
     )
-
-
-def _matchable(features: LocalFeatures | Anchor, camera: Camera) -> Matchable:
-    return Matchable(features.keypoints, features.descriptors, camera.width, camera.height)
 
 
 def pixel_size(camera: Camera, long_side_px: int) -> float:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
-from trigpoint.frame import LocalFeatures, ModelIdentity
+from trigpoint.frame import LocalFeatures, ModelIdentity, restore_descriptors
 from trigpoint.rigid import Rigid3, rotation_from_vector
 
 MODEL = ModelIdentity("test", "0" * 64, descriptor_dim=16, global_dim=32)
@@ -65,4 +65,6 @@ def require_image(reader: MapReader, index: int) -> None:
     assert anchor.name == f"folder/{index}.png"
     np.testing.assert_allclose(anchor.cam_from_world.t, make_pose(index).t, rtol=1e-12)
     np.testing.assert_allclose(anchor.keypoints, features.keypoints, atol=0.01)
-    np.testing.assert_allclose(anchor.descriptors, features.descriptors, atol=0.02)
+    np.testing.assert_allclose(
+        restore_descriptors(anchor.descriptors), features.descriptors, atol=0.02
+    )

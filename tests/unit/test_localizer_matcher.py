@@ -48,8 +48,8 @@ def test_a_network_of_mutual_nearest_neighbours_gives_the_same_pose(
         Localizer(model, reader, matcher=OnnxMatcher.load(path, dim, num_threads=1)), frame
     )
     assert network.statistics.num_matcher_failures == 0
-    assert abs(network.statistics.num_matches - ours.statistics.num_matches) < 20
-    # Sums of products in another order: matches of nearly equal scores may change places.
+    # In floats where ours are integers: matches of nearly equal scores change places.
+    assert abs(network.statistics.num_matches / ours.statistics.num_matches - 1) < 0.02
     centers = network.cam_from_world.center, ours.cam_from_world.center
     np.testing.assert_allclose(*centers, atol=2e-3)
     np.testing.assert_allclose(network.cam_from_world.R, ours.cam_from_world.R, atol=1e-3)

@@ -1,5 +1,7 @@
 """Matching by mutual nearest neighbours and by networks."""
 
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from tests.unit import graphs
 from trigpoint.errors import ModelError
+from trigpoint.frame import quantize_descriptors
 from trigpoint.models.matching import (
     Matchable,
     MutualNearestNeighbors,
@@ -59,6 +62,58 @@ def test_a_shuffled_copy_is_matched_wholly() -> None:
     np.testing.assert_allclose(similarities, 1, atol=1e-5)
 
 
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(0, 60), m=st.integers(0, 60))
+def test_integers_match_as_the_floats_that_they_stand_for(seed: int, n: int, m: int) -> None:
+    query, anchor = matchable(seed, n), matchable(seed + 1, m)
+    anchor = replace(anchor, descriptors=quantize_descriptors(anchor.normalized))
+    matches, cosines = MutualNearestNeighbors().match(query, anchor)
+    table = query.right.T.astype(np.float64) @ anchor.descriptors.T
+    expected = {
+        (i, j)
+        for i in range(n)
+        for j in range(m)
+        if table[i, j] == table[i].max() and table[i, j] == table[:, j].max()
+    }
+    found = {(int(i), int(j)) for i, j in matches}
+    assert found <= expected
+    queries, anchors = (
+        Counter(side) for side in ([i for i, _ in expected], [j for _, j in expected])
+    )
+    assert {(i, j) for i, j in expected if queries[i] == anchors[j] == 1} <= found
+    assert all(len(set(side)) == len(matches) for side in matches.T)
+    true = (query.normalized @ anchor.normalized.T)[matches[:, 0], matches[:, 1]]
+    np.testing.assert_allclose(cosines, true, atol=0.03)
+    assert (np.diff(cosines) <= 0).all()
+
+
+def test_no_sum_of_integers_saturates() -> None:
+    """Where x86 has no VNNI, two products of 8 bits are added in 16."""
+    largest = np.zeros((1, 64), np.float32)
+    largest[0, :2] = np.sqrt(0.5)  # beyond the range, so 127 and 63
+    image = Matchable(np.zeros((1, 2), np.float32), largest, 640, 480)
+    assert int(image.left.max()) * int(image.right.max()) * 2 == 255 * 63 * 2 < 2**15
+    _, cosine = MutualNearestNeighbors().match(image, image)
+    assert cosine[0] == pytest.approx(0.5)
+
+
+def test_equal_descriptors_are_in_one_match_each() -> None:
+    descriptors = np.repeat(unit(0, 5), 3, axis=0)
+    points = np.zeros((15, 2), np.float32)
+    image = Matchable(points, descriptors, 640, 480)
+    for matches, _ in (
+        match_mutual(descriptors, descriptors),
+        MutualNearestNeighbors().match(image, image),
+    ):
+        assert len(matches) == 5
+        assert all(len(set(side)) == 5 for side in matches.T)
+
+
+def test_the_packaged_graph_is_what_its_script_writes() -> None:
+    products = pytest.importorskip("training.products")
+    assert products.make_graph().SerializeToString() == Path(products.PATH).read_bytes()
+
+
 def adapted(source: Path, **fields: Any) -> OnnxMatcher:
     """Write a contract into a matcher and load it."""
     contract = {"kind": "matcher", "name": "foreign", "descriptor_dim": DIM, "min_score": -1.0}
@@ -73,7 +128,7 @@ def test_a_network_matches_in_any_form(tmp_path: Path, form: str) -> None:
     matcher = adapted(graphs.mutual_matcher(tmp_path / "matcher.onnx", form))
     query, anchor = matchable(0, 60), matchable(1, 50)
     matches, scores = matcher.match(query, anchor)
-    expected, similarities = MutualNearestNeighbors().match(query, anchor)
+    expected, similarities = match_mutual(query.normalized, anchor.normalized)
     assert len(matches) > 5
     np.testing.assert_array_equal(matches, expected)
     np.testing.assert_allclose(scores, similarities, atol=1e-5)

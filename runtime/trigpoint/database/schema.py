@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from trigpoint.camera import PARAMETERS, Camera
 from trigpoint.database.pages import HEADER_BYTES, DamageError
 from trigpoint.errors import ConfigError, DatabaseError
-from trigpoint.frame import LocalFeatures, ModelIdentity
+from trigpoint.frame import LocalFeatures, ModelIdentity, quantize_descriptors
 from trigpoint.rigid import Rigid3
 
 Array32 = NDArray[np.float32]
@@ -148,11 +148,10 @@ def encode_image(
     little (1024 x 64 are 17 pages and 20 bytes), the first keypoints go to the image instead, which
     lies in the tree's own pages.
     """
-    num_keypoints, dim = features.descriptors.shape
+    num_keypoints = len(features)
     step = _keypoint_step_px(camera)
     keypoints = np.rint((features.keypoints.astype(np.float64) + 0.5) / step).astype("<u2")
-    scaled = features.descriptors / np.float32(_descriptor_step(dim))
-    descriptors = np.clip(np.rint(scaled), -127, 127).astype(np.int8)
+    descriptors = quantize_descriptors(features.descriptors)
 
     stored = HEADER_BYTES + _CRC.size + keypoints.nbytes + descriptors.nbytes
     overhang = stored % 4096 if stored > 4096 else 0
@@ -198,25 +197,20 @@ def decode_image(payload: memoryview) -> Image:
     )
 
 
-def decode_features(image: Image, payload: memoryview, dim: int) -> tuple[Array32, Array32]:
-    """Read keypoints (N, 2) in px and normalised descriptors (N, D)."""
+def decode_features(
+    image: Image, payload: memoryview, dim: int
+) -> tuple[Array32, NDArray[np.int8]]:
+    """Read keypoints (N, 2) in px and quantized descriptors (N, D)."""
     split = 4 * (image.num_keypoints - len(image.first_keypoints))
     others = np.frombuffer(payload[:split], "<u2").reshape(-1, 2)
     fixed = np.concatenate([image.first_keypoints, others])
     keypoints = (fixed * _keypoint_step_px(image.camera) - 0.5).astype(np.float32)
-    # The scale of the descriptors cancels in the norm.
-    descriptors = np.frombuffer(payload[split:], np.int8).reshape(-1, dim).astype(np.float32)
-    norms = np.sqrt(np.einsum("ij,ij->i", descriptors, descriptors))
-    descriptors /= np.maximum(norms, np.float32(1))[:, None]
-    return keypoints, descriptors
+    # A copy: the mapping is the snapshot's, which ends.
+    return keypoints, np.frombuffer(payload[split:], np.int8).reshape(-1, dim).copy()
 
 
 def _keypoint_step_px(camera: Camera) -> float:
     return max(camera.width, camera.height) / 65_535
-
-
-def _descriptor_step(dim: int) -> float:
-    return 4 / (127 * float(np.sqrt(dim)))
 
 
 def quantize_row(row: Array32) -> tuple[np.float32, NDArray[np.int8]]:

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from onnxruntime import InferenceSession
 
+from trigpoint.camera import Camera
 from trigpoint.errors import ModelError
+from trigpoint.frame import Anchor, LocalFeatures, quantize_descriptors, restore_descriptors
 from trigpoint.models.contract import MatcherContract
-from trigpoint.models.session import Network, open_network
+from trigpoint.models.session import Network, open_network, open_session
 
 Array32 = NDArray[np.float32]
+Codes = NDArray[np.int8]
 Index = NDArray[np.intp]
+
+# Products of integers; made by `python -m training.products`.
+_PRODUCTS = Path(__file__).parent / "weights" / "products.onnx"
 
 # With fewer, nothing tells pairs (P, 2) from indices by keypoint (1, N), and there is no pose.
 _MIN_KEYPOINTS = 4
@@ -25,9 +33,37 @@ class Matchable:
     """What a matcher is told of an image."""
 
     keypoints: Array32  # (N, 2) px
-    descriptors: Array32  # (N, D), L2-normalised
+    descriptors: NDArray[Any]  # (N, D): float32, L2-normalised, or int8 as a map has them
     width: int
     height: int
+
+    @classmethod
+    def of(cls, image: LocalFeatures | Anchor, camera: Camera) -> Matchable:
+        """Take it of an image's features and its camera."""
+        return cls(image.keypoints, image.descriptors, camera.width, camera.height)
+
+    @cached_property
+    def normalized(self) -> Array32:
+        """The descriptors (N, D), L2-normalised."""
+        if self.descriptors.dtype == np.int8:
+            return restore_descriptors(self.descriptors)
+        return self.descriptors
+
+    @cached_property
+    def left(self) -> NDArray[np.uint8]:
+        """The descriptors (N, D) as the left factor of their products: of 8 bits, zero at 128."""
+        codes = self.descriptors
+        if codes.dtype != np.int8:
+            codes = quantize_descriptors(codes)
+        return codes.view(np.uint8) ^ np.uint8(128)
+
+    @cached_property
+    def right(self) -> Codes:
+        """The descriptors (D, N) as the right factor: of 7 bits, so that no sum saturates.
+
+        Without VNNI, x86 processors add two products of 8 bits in 16.
+        """
+        return np.ascontiguousarray(quantize_descriptors(self.normalized, 63).T)
 
 
 class Matcher(Protocol):
@@ -41,11 +77,20 @@ class Matcher(Protocol):
 
 
 class MutualNearestNeighbors:
-    """Matches descriptors that are each other's nearest neighbour."""
+    """Matches descriptors that are each other's nearest neighbour, in integers of 8 and 7 bits.
+
+    The anchor's are compared as they lie in the map, four times as fast as in floats. Integers are
+    exact: the matches are the same on every machine.
+    """
 
     def match(self, query: Matchable, anchor: Matchable) -> tuple[Index, Array32]:
         """Match two images; the scores are cosines."""
-        return match_mutual(query.descriptors, anchor.descriptors)
+        if len(query.keypoints) == 0 or len(anchor.keypoints) == 0:
+            return _NOTHING
+        (products,) = _products().run(None, {"left": anchor.left, "right": query.right})
+        matches, best = _mutual(products)
+        dim = len(query.right)
+        return matches[:, ::-1], best * np.float32(16 / (127 * 63 * dim))
 
 
 def match_mutual(query: Array32, anchor: Array32) -> tuple[Index, Array32]:
@@ -65,16 +110,26 @@ def match_mutual(query: Array32, anchor: Array32) -> tuple[Index, Array32]:
     """
     if len(query) == 0 or len(anchor) == 0:
         return _NOTHING
-    similarity = query @ anchor.T
+    return _mutual(query @ anchor.T)
+
+
+def _mutual(similarity: NDArray[Any]) -> tuple[Index, NDArray[Any]]:
     nearest = similarity.argmax(axis=1)
-    best = similarity[np.arange(len(query)), nearest]
+    best = similarity[np.arange(len(similarity)), nearest]
     # Against the column's maximum, not its arg-max: that is 20 times dearer in numpy.
     mutual = np.flatnonzero(best >= similarity.max(axis=0)[nearest])
     order = mutual[np.argsort(-best[mutual], kind="stable")]
+    # Of rows that are equally near to a column, the first.
+    order = order[np.sort(np.unique(nearest[order], return_index=True)[1])]
     return np.stack([order, nearest[order]], axis=1), best[order]
 
 
 _NOTHING = (np.empty((0, 2), np.intp), np.empty(0, np.float32))
+
+
+@cache
+def _products() -> InferenceSession:
+    return open_session(_PRODUCTS, num_threads=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +163,8 @@ class OnnxMatcher:
             {
                 "kpts0": self._points(query),
                 "kpts1": self._points(anchor),
-                "desc0": query.descriptors[None],
-                "desc1": anchor.descriptors[None],
+                "desc0": query.normalized[None],
+                "desc1": anchor.normalized[None],
             }
         )
         pairs, scores = _read_pairs(

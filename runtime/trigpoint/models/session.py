@@ -71,14 +71,8 @@ def open_network(path: Path, kind: type[C], num_threads: int) -> Network[C]:
     """Load a network of a kind and check that it keeps its contract."""
     if not path.is_file():
         raise ModelError(f"no such model file: {path}")
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = num_threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what goes wrong is raised
-    # Spinning threads would burn the cores that geometry needs between two frames.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        session = ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        session = open_session(path, num_threads)
     except Exception as error:  # onnxruntime's errors share no narrower base
         reason = str(error).splitlines()[0]
         raise ModelError(f"{path} is not a network that onnxruntime can load: {reason}") from error
@@ -89,6 +83,17 @@ def open_network(path: Path, kind: type[C], num_threads: int) -> Network[C]:
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
     return Network(path, contract, session)
+
+
+def open_session(path: Path, num_threads: int) -> ort.InferenceSession:
+    """Load a graph, with or without a contract."""
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = num_threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4  # what goes wrong is raised
+    # Spinning threads would burn the cores that geometry needs between two frames.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
 
 
 def _read_contract(session: ort.InferenceSession, kind: type[C]) -> C:
