@@ -23,6 +23,7 @@ from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.stages import LocalizerOptions
 from trigpoint_db.build import build_map, select_images
+from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.evaluate import evaluate
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.localize import Outcome, localize_images
@@ -39,6 +40,7 @@ def localize(
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "map.tpmap"
         build_map(path, survey, folder / "images", network)
+        calibrate_map(path, network)
         with MapReader.open(path, network.identity) as reader:
             localizer = Localizer(network, reader, LocalizerOptions(num_anchors=anchors))
             return {

@@ -10,6 +10,7 @@ import pytest
 
 from trigpoint.models.features import FeatureModel
 from trigpoint_db.build import build_map
+from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.demo import make_demo
 
 T = TypeVar("T")
@@ -53,6 +54,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory, model: FeatureModel) -> Demo:
     folder = tmp_path_factory.mktemp("demo")
     survey = make_demo(folder, num_survey=140, num_flight=16, progress=without_progress)
     build_map(folder / "map.tpmap", survey, folder / "survey", model)
+    calibrate_map(folder / "map.tpmap", model)
     return Demo(folder)
 
 

@@ -22,6 +22,7 @@ from trigpoint.models.matching import Matchable, MutualNearestNeighbors
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint.stages import LocalizerOptions
 from trigpoint_db.build import build_map, read_frame, select_images
+from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.poses import read_names, read_queries
 
@@ -50,6 +51,7 @@ def compare(
     with tempfile.TemporaryDirectory() as name:
         scratch = Path(name)
         build_map(scratch / "map.tpmap", survey, folder / "images", network)
+        calibrate_map(scratch / "map.tpmap", network)
         with MapReader.open(scratch / "map.tpmap", network.identity) as reader:
             anchors = {a.name: a for a in (reader.anchor(i) for i in range(len(reader)))}
             hloc = Hloc(checkout, scratch, list(anchors.values()), match_map(anchors))

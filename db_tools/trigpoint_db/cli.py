@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -22,7 +23,7 @@ from rich.table import Table
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError, SourceError, TrigpointError
-from trigpoint.frame import Failed, Localized, describe, summarize
+from trigpoint.frame import Failed, Localized, PoseNoise, describe, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel, find_model
 from trigpoint.models.matching import load_matcher
@@ -31,6 +32,7 @@ from trigpoint.rigid import Rigid3
 from trigpoint.stages import LocalizerOptions
 from trigpoint_db.adapt import adapt_model
 from trigpoint_db.build import append_map, build_map, check_files, select_images
+from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths
 from trigpoint_db.importers.colmap import read_model
@@ -93,11 +95,41 @@ def build(
     count = write(
         map_, track(posed, "mapping", len(posed)), images, network, max_keypoints=keypoints
     )
+    noise = calibrate_map(map_, network, track_calibration)
     size = map_.stat().st_size
     if as_json:
-        print(json.dumps({"map": str(map_), "num_images_added": count, "bytes": size}))
+        facts = {"map": str(map_), "num_images_added": count, "bytes": size}
+        print(json.dumps(facts | {"pose_noise": noise and asdict(noise)}))
     else:
-        print(f"{map_}: {count} images added, {size / 1e6:.1f} MB")
+        print(f"{map_}: {count} images added, {size / 1e6:.1f} MB; {describe_noise(noise)}")
+
+
+@app.command()
+def calibrate(
+    map_: MapPath, model: Model = "base", retrieval: Retrieval = None, as_json: Json = False
+) -> None:
+    """Measure how well the poses of a map agree, as `build` does, and note it in the map."""
+    network = FeatureModel.load(model, retrieval=retrieval)
+    noise = calibrate_map(map_, network, track_calibration)
+    if as_json:
+        print(json.dumps({"map": str(map_), "pose_noise": noise and asdict(noise)}))
+    else:
+        print(f"{map_}: {describe_noise(noise)}")
+
+
+def describe_noise(noise: PoseNoise | None) -> str:
+    """Say for people how well the poses of a map agree."""
+    if noise is None:
+        return "too few of its images could be localized to tell how well its poses agree"
+    return (
+        f"its poses agree to {noise.position * 100:.2g} % of their distance and "
+        f"{np.rad2deg(noise.rotation_rad):.2g} degrees"
+    )
+
+
+def track_calibration(images: list[int]) -> Iterator[int]:
+    """Show a progress bar of a calibration."""
+    return track(images, "calibrating", len(images))
 
 
 @app.command()
@@ -206,6 +238,7 @@ def info(map_: MapPath, as_json: Json = False) -> None:
             "model_sha256": reader.model.sha256,
             "descriptor_dim": reader.model.descriptor_dim,
             "global_dim": reader.model.global_dim,
+            "pose_noise": reader.pose_noise and asdict(reader.pose_noise),
             "bytes": map_.stat().st_size,
             "min_center": centers.min(axis=0).tolist() if len(centers) else None,
             "max_center": centers.max(axis=0).tolist() if len(centers) else None,
@@ -398,6 +431,7 @@ def demo(
     map_ = folder / "map.tpmap"
     network = FeatureModel.load()
     build_map(map_, track(posed, "mapping", len(posed)), folder / "survey", network)
+    calibrate_map(map_, network, track_calibration)
     if as_json:
         print(json.dumps({"folder": str(folder), "num_survey": survey, "num_flight": flight}))
     else:

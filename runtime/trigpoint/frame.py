@@ -79,6 +79,28 @@ class ModelIdentity:
     global_dim: int
 
 
+@dataclass(frozen=True)
+class PoseNoise:
+    """How well the poses of a map agree with each other.
+
+    Parameters
+    ----------
+    position : float
+        Standard deviation of the vector between two cameras, along each axis, as a share of its
+        length.
+    rotation_rad : float
+        Standard deviation of the rotation between two cameras, about each axis.
+    """
+
+    position: float
+    rotation_rad: float
+
+    def std(self, distances: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return standard deviations (K, 6) of (dc, dtheta) of cameras at these distances (K,)."""
+        position = np.repeat(self.position * distances[:, None], 3, axis=1)
+        return np.hstack([position, np.full_like(position, self.rotation_rad)])
+
+
 @dataclass(frozen=True, eq=False)
 class Anchor:
     """A reference image of the map, with its known pose."""

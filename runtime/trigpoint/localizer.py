@@ -13,19 +13,21 @@ from typing import Any
 
 from trigpoint.database.reader import MapReader
 from trigpoint.frame import Frame, Localized, Lost, Reason, Result, Statistics
-from trigpoint.geometry.triangulation import triangulate_robust
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import Matcher, MutualNearestNeighbors
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import (
     LocalizerOptions,
     average_poses,
+    choose_pose_noise,
     count_support,
     estimate_relative_poses,
     extract_turned,
+    find_latent_points,
     judge,
     match_anchors,
     refine,
+    refine_with_anchors,
     solve_latent_points,
 )
 
@@ -70,7 +72,7 @@ class Localizer:
         result = self._localize(frame, Statistics())
         if isinstance(result, Localized) or not self.options.try_turned:
             return result
-        if result.reason not in (Reason.FEW_MATCHES, Reason.FEW_INLIERS):
+        if result.reason in (Reason.NO_MAP, Reason.TOO_DARK, Reason.FEW_FEATURES):
             return result
         for turned_deg in (90, 180, 270):
             start = Statistics(turned_deg=turned_deg, stage_ms=result.statistics.stage_ms)
@@ -105,13 +107,13 @@ class Localizer:
             return trace.lost(Reason.FEW_ANCHORS, "the map holds a single image")
 
         with trace.stage("matching"):
-            query = match_anchors(frame, features, anchors, self.matcher, self.model.long_side_px)
+            query = match_anchors(
+                frame.camera, features, anchors, self.matcher, self.model.long_side_px
+            )
         trace.note(num_matches=len(query.tracks), num_matcher_failures=query.num_matcher_failures)
 
         with trace.stage("latent_points"):
-            latent = triangulate_robust(
-                query.views, query.tracks, max_error_px=options.max_ray_error_px
-            )
+            latent = find_latent_points(query, options)
         trace.note(num_points=len(latent.point))
         if len(latent.point) < options.min_inliers:
             return trace.lost(Reason.FEW_MATCHES, f"{len(latent.point)} points in two anchors")
@@ -144,10 +146,16 @@ class Localizer:
         with trace.stage("refinement"):
             _, generator, hypothesis = max(hypotheses, key=lambda hypothesis: hypothesis[0])
             latent, refined = refine(query, hypothesis, options)
+            if refined is not None:
+                pose_noise = choose_pose_noise(options, self.reader.pose_noise)
+                refined = refine_with_anchors(
+                    query, latent, refined.cam_from_world, options, pose_noise
+                )
         trace.note(generator=generator, num_points=len(latent.point))
         if refined is None:
             return trace.lost(Reason.FEW_INLIERS, "the latent points do not determine a pose")
         trace.note(num_inliers=int(refined.inliers.sum()))
+        refined = replace(refined, covariance=refined.covariance * options.covariance_scale)
         objection = judge(latent, refined, options)
         if objection is not None:
             return trace.lost(*objection)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError, ModelError
-from trigpoint.frame import Anchor, Frame, LocalFeatures, Reason
+from trigpoint.frame import Anchor, LocalFeatures, PoseNoise, Reason
 from trigpoint.geometry.absolute_pose import estimate_absolute_pose
 from trigpoint.geometry.anchor_ransac import NoConsensus, find_consensus
 from trigpoint.geometry.center_averaging import (
@@ -24,7 +24,7 @@ from trigpoint.geometry.center_averaging import (
     center_directions,
 )
 from trigpoint.geometry.epipolar import essential_matrix, sampson_error
-from trigpoint.geometry.joint_refinement import PoseNoise, refine_jointly
+from trigpoint.geometry.joint_refinement import refine_jointly
 from trigpoint.geometry.pose_refinement import RefinedPose, refine_pose, reprojection
 from trigpoint.geometry.relative_pose import estimate_relative_pose
 from trigpoint.geometry.rotation_averaging import average_rotations
@@ -35,6 +35,8 @@ from trigpoint.rigid import Rigid3
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+UNMEASURED = PoseNoise(0.01, 0.002)  # of a map that does not say: better too large
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,9 @@ class LocalizerOptions:
     max_reprojection_error_px: float = 4.0
     keypoint_sigma_px: float = 0.5
     num_refined_anchors: int = 8  # those with the most guided matches
-    map_position_noise: float = 0.003  # of the distance between two cameras of the map
-    map_rotation_noise_deg: float = 0.02
+    map_position_noise: float | None = None  # of the distance between two cameras; see PoseNoise
+    map_rotation_noise_deg: float | None = None  # without them, what the map says of itself
+    covariance_scale: float = 4.0  # docs/method.md tells how it was measured
     min_features: int = 50
     min_inliers: int = 30
     min_inlier_ratio: float = 0.4
@@ -133,19 +136,19 @@ def extract_turned(
 
 
 def match_anchors(
-    frame: Frame,
+    camera: Camera,
     features: LocalFeatures,
     anchors: Sequence[Anchor],
     matcher: Matcher,
     long_side_px: int,
 ) -> Query:
     """Match the query's features with each anchor's and normalise what matched."""
-    points = frame.camera.normalize(features.keypoints)
+    points = camera.normalize(features.keypoints)
     seen = np.asarray(np.isfinite(points).all(axis=1))
     matches: list[Index] = []
     anchor_points: list[Array] = []
     num_failures = 0
-    query = Matchable.of(features, frame.camera)
+    query = Matchable.of(features, camera)
     fallback = MutualNearestNeighbors()
     for anchor in anchors:
         other = Matchable.of(anchor, anchor.camera)
@@ -166,7 +169,7 @@ def match_anchors(
     tracks = Tracks(point[order], view[order], xy, views_px[view[order]])
     return Query(
         points,
-        pixel_size(frame.camera, long_side_px),
+        pixel_size(camera, long_side_px),
         Rigid3.stack(anchor.cam_from_world for anchor in anchors),
         views_px,
         tracks,
@@ -243,6 +246,13 @@ def average_poses(
     return Rigid3.from_center(average_rotations(relative.R @ anchors.R), center), len(anchors)
 
 
+def find_latent_points(query: Query, options: LocalizerOptions) -> LatentPoints:
+    """Latent points of all matches, by their linear estimate: that is enough for a hypothesis."""
+    return triangulate_robust(
+        query.views, query.tracks, max_error_px=options.max_ray_error_px, num_iterations=0
+    )
+
+
 def solve_latent_points(
     query: Query, latent: LatentPoints, options: LocalizerOptions
 ) -> Rigid3 | None:
@@ -279,7 +289,7 @@ def guide_matches(query: Query, cam_from_world: Rigid3, max_error_px: float) -> 
 def refine(
     query: Query, cam_from_world: Rigid3, options: LocalizerOptions
 ) -> tuple[LatentPoints, RefinedPose | None]:
-    """Stage 2 of the paper: guided matches, latent points (E1), pose (E2); then all together."""
+    """Stage 2 of the paper: guided matches, latent points (E1), pose (E2)."""
     tracks = guide_matches(query, cam_from_world, options.max_guided_error_px)
     num_matches = np.bincount(tracks.view, minlength=len(query.views))
     chosen = np.argsort(-num_matches, kind="stable")[: options.num_refined_anchors]
@@ -296,22 +306,38 @@ def refine(
         sigma=options.keypoint_sigma_px * query.px,
         max_error=options.max_reprojection_error_px * query.px,
     )
-    if refined is None:
-        return latent, None
-    view = np.searchsorted(chosen := np.sort(chosen), latent.tracks.view)
-    refined = refine_jointly(
-        refined.cam_from_world,
+    return latent, refined
+
+
+def refine_with_anchors(
+    query: Query,
+    latent: LatentPoints,
+    cam_from_world: Rigid3,
+    options: LocalizerOptions,
+    pose_noise: PoseNoise,
+) -> RefinedPose | None:
+    """Refine once more, with the anchors' poses free to move by the map's noise."""
+    chosen, view = np.unique(latent.tracks.view, return_inverse=True)
+    return refine_jointly(
+        cam_from_world,
         query.views[chosen],
         replace(latent, tracks=replace(latent.tracks, view=view)),
         query.points[latent.point],
         px=query.px,
         sigma_px=options.keypoint_sigma_px,
-        pose_noise=PoseNoise(
-            options.map_position_noise, np.deg2rad(options.map_rotation_noise_deg)
-        ),
+        pose_noise=pose_noise,
         max_error_px=options.max_reprojection_error_px,
     )
-    return latent, refined
+
+
+def choose_pose_noise(options: LocalizerOptions, measured: PoseNoise | None) -> PoseNoise:
+    """Return the noise of a map's poses: as set, else as measured, else a guess."""
+    noise = measured or UNMEASURED
+    if options.map_position_noise is not None:
+        noise = replace(noise, position=options.map_position_noise)
+    if options.map_rotation_noise_deg is not None:
+        noise = replace(noise, rotation_rad=float(np.deg2rad(options.map_rotation_noise_deg)))
+    return noise
 
 
 def judge(

@@ -6,7 +6,8 @@ from scipy.stats import chi2
 
 from tests.unit.scenes import generator, make_scene
 from tests.unit.test_pose_refinement import errors
-from trigpoint.geometry.joint_refinement import PoseNoise, refine_jointly
+from trigpoint.frame import PoseNoise
+from trigpoint.geometry.joint_refinement import invert_symmetric, refine_jointly
 from trigpoint.geometry.pose_refinement import RefinedPose, perturb, refine_pose
 from trigpoint.geometry.triangulation import LatentPoints, Tracks, triangulate
 from trigpoint.rigid import Rigid3
@@ -155,3 +156,9 @@ def test_points_behind_the_query_determine_no_pose() -> None:
     survey = Survey("joint behind")
     turned = Rigid3(np.diag([-1.0, 1.0, -1.0]) @ survey.truth.R, survey.truth.t)
     assert survey.refine_jointly(turned) is None
+
+
+def test_cofactors_invert_as_lapack_does() -> None:
+    A = generator("invert").normal(size=(50, 3, 3))
+    H = A @ np.swapaxes(A, 1, 2) * np.logspace(-12, 12, 50)[:, None, None]
+    np.testing.assert_allclose(invert_symmetric(H) @ H, np.tile(np.eye(3), (50, 1, 1)), atol=1e-6)

@@ -15,7 +15,7 @@ from trigpoint.database.pages import DamageError
 from trigpoint.database.ranking import POOL, choose_diverse, find_largest
 from trigpoint.database.snapshot import Snapshot, reporting
 from trigpoint.errors import DatabaseError
-from trigpoint.frame import Anchor, ModelIdentity
+from trigpoint.frame import Anchor, LocalFeatures, ModelIdentity, PoseNoise, restore_descriptors
 from trigpoint.rigid import Rigid3
 
 Array32 = NDArray[np.float32]
@@ -63,6 +63,11 @@ class MapReader:
         """Rises with each commit."""
         return self._current.metadata.generation
 
+    @property
+    def pose_noise(self) -> PoseNoise | None:
+        """How well the poses of the map agree; None where that was not measured."""
+        return self._current.metadata.pose_noise
+
     def __len__(self) -> int:
         return self._current.metadata.num_images
 
@@ -85,6 +90,15 @@ class MapReader:
                 image, snapshot.get(schema.features_key(index)), self.model.descriptor_dim
             )
         return Anchor(image.name, image.camera, image.cam_from_world, keypoints, descriptors)
+
+    def features(self, index: int) -> LocalFeatures:
+        """Return an image's features as if it were a query; its scores are not in the map."""
+        anchor = self.anchor(index)
+        with self._reading() as snapshot:
+            (described,) = _descriptors(snapshot, np.array([index]))
+        scores = np.zeros(len(anchor.keypoints), np.float32)
+        descriptors = restore_descriptors(anchor.descriptors)
+        return LocalFeatures(anchor.keypoints, descriptors, scores, described)
 
     def search(
         self, global_descriptor: Array32, k: int, diversity: float = 0.0

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from trigpoint.camera import PARAMETERS, Camera
 from trigpoint.database.pages import HEADER_BYTES, DamageError
 from trigpoint.errors import ConfigError, DatabaseError
-from trigpoint.frame import LocalFeatures, ModelIdentity, quantize_descriptors
+from trigpoint.frame import LocalFeatures, ModelIdentity, PoseNoise, quantize_descriptors
 from trigpoint.rigid import Rigid3
 
 Array32 = NDArray[np.float32]
@@ -100,6 +100,7 @@ class Metadata:
     model: ModelIdentity  # of the network that made the features
     generation: int = 0  # rises with each commit
     num_images: int = 0
+    pose_noise: PoseNoise | None = None  # as measured
 
     def encode(self) -> bytes:
         """Write JSON."""
@@ -114,7 +115,14 @@ class Metadata:
                 f"a map of format {found}, and this version reads format {FORMAT}; "
                 "rebuild it with `trigpoint-db build` or use the version that made it"
             )
-        return cls(**{**fields, "model": ModelIdentity(**fields["model"])})
+        noise = fields.get("pose_noise")
+        return cls(
+            **fields
+            | {
+                "model": ModelIdentity(**fields["model"]),
+                "pose_noise": None if noise is None else PoseNoise(**noise),
+            }
+        )
 
 
 def encode_index(index: int) -> bytes:

@@ -20,7 +20,7 @@ from trigpoint.database import schema
 from trigpoint.database.pages import DamageError
 from trigpoint.database.snapshot import Snapshot, reporting, share_environment
 from trigpoint.errors import DatabaseError
-from trigpoint.frame import LocalFeatures, ModelIdentity
+from trigpoint.frame import LocalFeatures, ModelIdentity, PoseNoise
 from trigpoint.rigid import Rigid3
 
 
@@ -37,6 +37,7 @@ class MapWriter:
         self._fd = fd
         self._metadata = metadata  # as committed
         self._num_images = metadata.num_images
+        self._pose_noise = metadata.pose_noise
         self._scales: list[np.float32] = []  # of the last retrieval block, unless it is full
         self._rows: list[NDArray[np.int8]] = []
         self._environment: lmdb.Environment | None = _writable_environment(path, fd)
@@ -104,18 +105,19 @@ class MapWriter:
                 self._scales, self._rows = [], []
         return index
 
+    def set_pose_noise(self, noise: PoseNoise | None) -> None:
+        """Say how well the poses of the map agree, None if that is not known."""
+        self._pose_noise = noise
+
     def commit(self) -> None:
         """Put what was added on disk; returns when it is there."""
-        if self._num_images == self._metadata.num_images:
+        metadata = replace(self._metadata, num_images=self._num_images, pose_noise=self._pose_noise)
+        if metadata == self._metadata:
             return
         with self._writing() as txn:
             if self._rows:
                 self._put_last_block(txn)
-            metadata = replace(
-                self._metadata,
-                generation=self._metadata.generation + 1,
-                num_images=self._num_images,
-            )
+            metadata = replace(metadata, generation=metadata.generation + 1)
             _put(txn, schema.METADATA_KEY, metadata.encode())
             txn.commit()
             self._txn, self._metadata = None, metadata

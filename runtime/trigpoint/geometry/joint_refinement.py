@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from trigpoint.frame import PoseNoise
 from trigpoint.geometry.pose_refinement import (
     CAUCHY,
     MIN_POINTS,
@@ -26,27 +27,6 @@ from trigpoint.geometry.triangulation import LatentPoints
 from trigpoint.rigid import Rigid3, rotate
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class PoseNoise:
-    """How well the poses of a map agree with each other.
-
-    Parameters
-    ----------
-    position : float
-        Standard deviation of the distance between two cameras, as a share of it, along each axis.
-    rotation_rad : float
-        Standard deviation of the rotation between two cameras, about each axis.
-    """
-
-    position: float
-    rotation_rad: float
-
-    def std(self, distances: Array) -> Array:
-        """Return standard deviations (K, 6) of (dc, dtheta) of cameras at these distances (K,)."""
-        position = np.repeat(self.position * distances[:, None], 3, axis=1)
-        return np.hstack([position, np.full_like(position, self.rotation_rad)])
 
 
 def refine_jointly(
@@ -134,7 +114,7 @@ class _Points:
 
     covariance: Array  # (M, 3, 3)
     step: Array  # (M, 3): to the minimum of E1
-    gain: Array  # (M, 6K, 3): a change u of the anchors' errors moves them by -u^T gain
+    gain: Array  # (M, 3, 6K): a change u of the anchors' errors moves them by -gain u
     information: Array  # (6K, 6K)
     gradient: Array  # (6K,)
     square: Array  # (P,): of the residuals, in sigma
@@ -161,7 +141,7 @@ class _System:
         return _State(
             perturb(state.cam_from_world, step[-6:]),
             state.errors + step[:-6].reshape(-1, 6),
-            state.points3d + self.points.step - step[:-6] @ self.points.gain,
+            state.points3d + self.points.step - self.points.gain @ step[:-6],
         )
 
     def covariance(self) -> Array:
@@ -199,7 +179,7 @@ class _Problem:
         limit = (self.max_error_px / self.sigma_px) ** 2
         square = np.where(inliers, (r**2).sum(axis=1), limit)
         weight = np.where(inliers, 1 / (1 + square / CAUCHY**2), 0.0)
-        J = whiten @ np.concatenate([-by_point @ np.swapaxes(points.gain, 1, 2), by_pose], axis=2)
+        J = whiten @ np.concatenate([-by_point @ points.gain, by_pose], axis=2)
         root = np.sqrt(weight)[:, None]
         J = np.reshape(J * root[:, :, None], (2 * len(r), -1))
 
@@ -232,19 +212,30 @@ class _Problem:
 
         H = np.add.reduceat(B_transposed @ B, starts)
         trace = np.trace(H, axis1=1, axis2=2)  # rays that are nearly parallel leave H singular
-        C = np.linalg.inv(H + (1e-9 * (trace + np.median(trace)))[:, None, None] * np.eye(3))
+        C = invert_symmetric(H + (1e-9 * (trace + np.median(trace)))[:, None, None] * np.eye(3))
         step = -rotate(C, np.add.reduceat(rotate(B_transposed, r), starts))
-        W = np.zeros((num_points, num_views, 6, 3))
-        W[index, tracks.view] = np.swapaxes(by_error, 1, 2) @ B
-        by_point = np.reshape(W, (num_points, -1, 3))
-        gain = by_point @ C
+        mixed = np.zeros((num_points, 3, num_views, 6))
+        mixed[index, :, tracks.view] = B_transposed @ by_error
+        gain = C @ mixed.reshape(num_points, 3, -1)
 
-        flat = np.reshape(by_point.transpose(1, 0, 2), (6 * num_views, -1))
-        information = -flat @ np.reshape(gain.transpose(1, 0, 2), flat.shape).T
-        gradient = flat @ step.ravel()
+        flat = mixed.reshape(3 * num_points, -1)
+        information = -flat.T @ gain.reshape(flat.shape)
+        gradient = flat.T @ step.ravel()
         for view in range(num_views):
             own, block = tracks.view == view, slice(6 * view, 6 * view + 6)
             a = by_error[own].reshape(-1, 6)
             information[block, block] += a.T @ a
             gradient[block] += a.T @ r[own].ravel()
         return _Points(C, step, gain, information, gradient, square, weight)
+
+
+def invert_symmetric(H: Array) -> Array:
+    """Invert symmetric matrices (M, 3, 3) by cofactors: five times as fast as LAPACK one by one.
+
+    As exact as their condition lets them; 1e9 here, by the floor on the diagonal.
+    """
+    a, b, c, d, e, f = (H[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    inverse = np.stack([A, B, C, B, D, E, C, E, F], axis=1).reshape(-1, 3, 3)
+    return inverse / (a * A + b * B + c * C)[:, None, None]

@@ -129,16 +129,14 @@ def refine_pose(
     damping = 1e-4
     cost, r, J, square, inliers = evaluate(cam_from_world)
     for _ in range(num_iterations):
-        weight = np.where(inliers, 1 / (1 + square / CAUCHY**2), 0.0)
-        H = np.einsum("m,mki,mkj->ij", weight, J, J, optimize=True)
-        g = np.einsum("m,mki,mk->i", weight, J, r, optimize=True)
+        H, g, _ = _normal_equations(r, J, square, inliers)
         if inliers.sum() < MIN_POINTS or not is_determined(H):
             return None
-        step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
+        step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g).astype(np.float64, copy=False)
         candidate = perturb(cam_from_world, step)
         new = evaluate(candidate)
         if new[0] <= cost:
-            converged = cost - new[0] < 1e-9 * (1 + cost)
+            converged = cost - new[0] < 1e-6 * (1 + cost)
             cam_from_world, (cost, r, J, square, inliers) = candidate, new
             damping = max(damping / 10, 1e-9)
             if converged:
@@ -147,21 +145,23 @@ def refine_pose(
             damping *= 10
             if damping > 1e6:
                 break
-    return _with_covariance(cam_from_world, J, square, inliers)
-
-
-def _with_covariance(
-    cam_from_world: Rigid3, J: Array, square: Array, inliers: NDArray[np.bool_]
-) -> RefinedPose | None:
-    """Add the covariance: inverse information of the weighted points times the residuals' scale."""
-    weight = np.where(inliers, 1 / (1 + square / CAUCHY**2), 0.0)
-    H = np.einsum("m,mki,mkj->ij", weight, J, J, optimize=True)
+    H, _, weight = _normal_equations(r, J, square, inliers)
     if inliers.sum() < MIN_POINTS or not is_determined(H):
         return None
     dof = max(2 * weight.sum() - 6, 0.0)
     variance = (float((weight * square).sum()) + PRIOR_DOF) / (dof + PRIOR_DOF)
     covariance = np.linalg.inv(H) * variance
     return RefinedPose(cam_from_world, (covariance + covariance.T) / 2, inliers)
+
+
+def _normal_equations(
+    r: Array, J: Array, square: Array, inliers: NDArray[np.bool_]
+) -> tuple[Array, Array, Array]:
+    """Return normal matrix (6, 6), gradient (6,) and the points' weights (M,), by Cauchy's loss."""
+    weight = np.where(inliers, 1 / (1 + square / CAUCHY**2), 0.0)
+    root = np.sqrt(weight)[:, None]
+    flat = np.reshape(J * root[:, :, None], (-1, 6))
+    return flat.T @ flat, flat.T @ (r * root).ravel(), weight
 
 
 def is_determined(H: Array) -> bool:

@@ -48,9 +48,14 @@ class Tracks:
 
     def of_length(self, min_length: int) -> Tracks:
         """Keep the points with at least so many observations."""
+        return self[self.in_groups_of(min_length, np.ones(len(self), bool))]
+
+    def in_groups_of(self, min_length: int, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Of the observations kept (P,), say which are of points that keep at least so many."""
         _, starts = self.groups()
         lengths = np.diff(starts, append=len(self))
-        return self[np.repeat(lengths >= min_length, lengths)]
+        num_kept = np.add.reduceat(kept.astype(np.intp), starts) if len(self) else lengths
+        return kept & np.repeat(num_kept >= min_length, lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,20 +86,26 @@ def intersect_rays(views_from_world: Rigid3, tracks: Tracks) -> Array:
     For each point the solution of sum (I - d d^T) X = sum (I - d d^T) c, as in Proposition 1, with
     weights 1 / px^2. Rays that are nearly parallel give a point far away, not an error.
     """
-    _, starts = tracks.groups()
+    return _solve_rays(_ray_equations(views_from_world, tracks), tracks.groups()[1])
+
+
+def _ray_equations(views_from_world: Rigid3, tracks: Tracks) -> Array:
+    """Say what each ray adds to its point's equations (P, 3, 5): I - d d^T, (I - d d^T) c, c."""
     R = views_from_world.R[tracks.view]
     d = rotate(np.swapaxes(R, 1, 2), homogeneous(tracks.xy))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     c = views_from_world.center[tracks.view]
     normal = (np.eye(3) - d[:, :, None] * d[:, None, :]) / tracks.px[:, None, None] ** 2
-    A = np.add.reduceat(normal, starts)
-    b = np.add.reduceat(rotate(normal, c), starts)
+    return np.concatenate([normal, rotate(normal, c)[:, :, None], c[:, :, None]], axis=2)
+
+
+def _solve_rays(equations: Array, starts: Index) -> Array:
+    total = np.add.reduceat(equations, starts)
+    A, b = total[:, :, :3], total[:, :, 3:4]
+    mean = total[:, :, 4:] / np.diff(starts, append=len(equations))[:, None, None]
     # Parallel rays leave A singular along themselves: a tiny pull to the mean center settles it.
-    pull = 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None]
-    mean = np.add.reduceat(c, starts) / np.diff(starts, append=len(tracks))[:, None]
-    solution: Array = np.linalg.solve(
-        A + pull[:, :, None] * np.eye(3), (b + pull * mean)[:, :, None]
-    )[:, :, 0]
+    pull = 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None]
+    solution: Array = np.linalg.solve(A + pull * np.eye(3), b + pull * mean)[:, :, 0]
     return solution
 
 
@@ -193,29 +204,34 @@ def triangulate(
 
 
 def triangulate_robust(
-    views_from_world: Rigid3, tracks: Tracks, *, max_error_px: float
+    views_from_world: Rigid3, tracks: Tracks, *, max_error_px: float, num_iterations: int = 3
 ) -> LatentPoints:
     """Triangulate points whose observations may be wrong.
 
     The worst observation of a point is dropped, and the point triangulated again, while any is
     farther than `max_error_px` from its projection, or behind its view. A point ends with at least
-    two observations or not at all.
+    two observations or not at all. What is left is triangulated with `num_iterations`.
     """
     active = tracks.of_length(2)
+    equations = _ray_equations(views_from_world, active)
     settled: list[Tracks] = []
     while len(active):
         _, starts = active.groups()
         lengths = np.diff(starts, append=len(active))
-        X = intersect_rays(views_from_world, active)
-        r, _, in_front = project_tracks(views_from_world, active, X)
-        errors = np.where(in_front, np.sqrt((r**2).sum(axis=1)), np.inf)
+        X = _solve_rays(equations, starts)
+        Y = views_from_world[active.view].apply(np.repeat(X, lengths, axis=0))
+        in_front = Y[:, 2] > 0
+        z = np.where(in_front, Y[:, 2], 1.0)
+        r = Y[:, :2] / z[:, None] - active.xy
+        errors = np.where(in_front, np.sqrt((r**2).sum(axis=1)) / active.px, np.inf)
         worst = np.maximum.reduceat(errors, starts)
         done = np.repeat(worst <= max_error_px, lengths)
         settled.append(active[done])
         is_worst = errors == np.repeat(worst, lengths)
-        active = active[~done & ~is_worst].of_length(2)
+        left = active.in_groups_of(2, ~done & ~is_worst)
+        active, equations = active[left], equations[left]
     kept = _concatenate(settled)
-    points3d, covariance = triangulate(views_from_world, kept)
+    points3d, covariance = triangulate(views_from_world, kept, num_iterations=num_iterations)
     return LatentPoints(kept.groups()[0], points3d, covariance, kept)
 
 
