@@ -19,43 +19,34 @@ from scipy.spatial.transform import Rotation
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
 from trigpoint.frame import PoseNoise
-from trigpoint.geometry.pose_refinement import RefinedPose
-from trigpoint.geometry.triangulation import LatentPoints
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import MutualNearestNeighbors
-from trigpoint.rigid import Rigid3
 from trigpoint.stages import (
     LocalizerOptions,
-    Query,
     find_latent_points,
     judge,
     match_anchors,
+    mean_distance,
     refine,
     refine_with_anchors,
     solve_latent_points,
 )
 
-NUM_IMAGES = 24
-MAX_POINTS = 250  # of a trial: enough to tell, and quick
+NUM_IMAGES = 32
 GAPS = (0, 8, 24)  # images left out on either side
 MIN_TRIALS = 10
-POSITION = tuple(0.0005 * 2**k for k in range(8))  # to 6 % of the distance
-ROTATION_RAD = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
+POSITION = (0.0, *(0.0005 * 2**k for k in range(9)))  # to 13 % of the distance
+ROTATION_RAD = (0.0, *(0.0001 * 2**k for k in range(9)))
 STUDENT_DOF = 4.0  # errors have long tails: those of wrong poses must not set the noise
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One image of the map, localized against others up to the last refinement."""
+    """One image of the map, localized against others."""
 
-    truth: Rigid3
-    query: Query
-    latent: LatentPoints
-    start: Rigid3
-
-    def refine(self, options: LocalizerOptions, noise: PoseNoise) -> RefinedPose | None:
-        """Do the last refinement."""
-        return refine_with_anchors(self.query, self.latent, self.start, options, noise)
+    error: NDArray[np.float64]  # (6,): (dc, dtheta), as of `Localized`
+    covariance: NDArray[np.float64]  # (6, 6): without the map's noise
+    distance: float  # of the anchors, in the mean
 
 
 def calibrate_map(
@@ -83,20 +74,26 @@ def measure_pose_noise(
     ]
     if len(trials) < MIN_TRIALS:
         return None
-    costs: dict[tuple[int, int], float] = {}
-
-    def cost(cell: tuple[int, int]) -> float:
-        if cell not in costs:
-            noise = PoseNoise(POSITION[cell[0]], ROTATION_RAD[cell[1]])
-            costs[cell] = float(np.mean([_surprise(trial, options, noise) for trial in trials]))
-        return costs[cell]
-
-    best, previous = (3, 2), None
-    while best != previous:
-        previous = best
-        best = min(((row, best[1]) for row in range(len(POSITION))), key=cost)
-        best = min(((best[0], column) for column in range(len(ROTATION_RAD))), key=cost)
-    return PoseNoise(POSITION[best[0]], ROTATION_RAD[best[1]])
+    errors = np.array([trial.error for trial in trials])
+    covariances = np.array([trial.covariance for trial in trials])
+    distances = np.array([trial.distance for trial in trials])
+    center, rotation = slice(0, 3), slice(3, 6)
+    return PoseNoise(
+        min(
+            POSITION,
+            key=lambda share: _surprise(
+                errors[:, center], covariances[:, center, center], share * distances
+            ),
+        ),
+        min(
+            ROTATION_RAD,
+            key=lambda angle: _surprise(
+                errors[:, rotation],
+                covariances[:, rotation, rotation],
+                np.full_like(distances, angle),
+            ),
+        ),
+    )
 
 
 def _try_image(
@@ -121,27 +118,20 @@ def _try_image(
     latent, refined = refine(query, start, options)
     if refined is None or judge(latent, refined, options) is not None:
         return None
-    return Trial(image.cam_from_world, query, _thin_out(latent), refined.cam_from_world)
-
-
-def _thin_out(latent: LatentPoints) -> LatentPoints:
-    kept = np.unique(np.linspace(0, len(latent.point) - 1, MAX_POINTS).astype(int))
-    point = latent.point[kept]
-    tracks = latent.tracks[np.isin(latent.tracks.point, point)]
-    return LatentPoints(point, latent.points3d[kept], latent.covariance[kept], tracks)
-
-
-def _surprise(trial: Trial, options: LocalizerOptions, noise: PoseNoise) -> float:
-    """Negative log-likelihood of an error, Student's t for center and rotation each."""
-    refined = trial.refine(options, noise)
+    refined = refine_with_anchors(query, latent, refined.cam_from_world, options)
     if refined is None:
-        return 0.0
-    pose, C = refined.cam_from_world, refined.covariance
-    dtheta = Rotation.from_matrix(trial.truth.R.T @ pose.R).as_rotvec()
-    return _student(trial.truth.center - pose.center, C[:3, :3]) + _student(dtheta, C[3:, 3:])
+        return None
+    truth, pose = image.cam_from_world, refined.cam_from_world
+    dtheta = Rotation.from_matrix(truth.R.T @ pose.R).as_rotvec()
+    error = np.concatenate([truth.center - pose.center, dtheta])
+    return Trial(error, refined.covariance, mean_distance(query, latent, pose))
 
 
-def _student(error: NDArray[np.float64], C: NDArray[np.float64]) -> float:
-    square = error @ np.linalg.solve(C, error)
+def _surprise(
+    errors: NDArray[np.float64], covariances: NDArray[np.float64], std: NDArray[np.float64]
+) -> float:
+    """Negative log-likelihood of errors (T, 3), Student's t, with more noise std (T,) an axis."""
+    C = covariances + std[:, None, None] ** 2 * np.eye(3)
+    squares = np.einsum("ti,tij,tj->t", errors, np.linalg.inv(C), errors)
     spread = np.linalg.slogdet(C)[1] / 2
-    return float(spread + (STUDENT_DOF + 3) / 2 * np.log1p(square / STUDENT_DOF))
+    return float((spread + (STUDENT_DOF + 3) / 2 * np.log1p(squares / STUDENT_DOF)).mean())

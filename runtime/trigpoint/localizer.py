@@ -17,15 +17,17 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import Matcher, MutualNearestNeighbors
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import (
+    UNMEASURED,
     LocalizerOptions,
     average_poses,
-    choose_pose_noise,
+    calibrate_covariance,
     count_support,
     estimate_relative_poses,
     extract_turned,
     find_latent_points,
     judge,
     match_anchors,
+    mean_distance,
     refine,
     refine_with_anchors,
     solve_latent_points,
@@ -147,15 +149,15 @@ class Localizer:
             _, generator, hypothesis = max(hypotheses, key=lambda hypothesis: hypothesis[0])
             latent, refined = refine(query, hypothesis, options)
             if refined is not None:
-                pose_noise = choose_pose_noise(options, self.reader.pose_noise)
-                refined = refine_with_anchors(
-                    query, latent, refined.cam_from_world, options, pose_noise
-                )
+                refined = refine_with_anchors(query, latent, refined.cam_from_world, options)
         trace.note(generator=generator, num_points=len(latent.point))
         if refined is None:
             return trace.lost(Reason.FEW_INLIERS, "the latent points do not determine a pose")
         trace.note(num_inliers=int(refined.inliers.sum()))
-        refined = replace(refined, covariance=refined.covariance * options.covariance_scale)
+        distance = mean_distance(query, latent, refined.cam_from_world)
+        map_noise = self.reader.pose_noise or UNMEASURED
+        covariance = calibrate_covariance(refined.covariance, distance, map_noise, options)
+        refined = replace(refined, covariance=covariance)
         objection = judge(latent, refined, options)
         if objection is not None:
             return trace.lost(*objection)

@@ -36,7 +36,7 @@ from trigpoint.rigid import Rigid3
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-UNMEASURED = PoseNoise(0.01, 0.002)  # of a map that does not say: better too large
+UNMEASURED = PoseNoise(0.005, 0.001)  # of a map that does not say: better too large
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class LocalizerOptions:
     max_reprojection_error_px: float = 4.0
     keypoint_sigma_px: float = 0.5
     num_refined_anchors: int = 8  # those with the most guided matches
-    map_position_noise: float | None = None  # of the distance between two cameras; see PoseNoise
-    map_rotation_noise_deg: float | None = None  # without them, what the map says of itself
-    covariance_scale: float = 4.0  # docs/method.md tells how it was measured
+    anchor_position_noise: float = 0.004  # of its distance; how far an anchor may move
+    anchor_rotation_noise_deg: float = 0.02
+    covariance_scale: float = 4.0  # errors have longer tails than a normal distribution
     min_features: int = 50
     min_inliers: int = 30
     min_inlier_ratio: float = 0.4
@@ -310,13 +310,9 @@ def refine(
 
 
 def refine_with_anchors(
-    query: Query,
-    latent: LatentPoints,
-    cam_from_world: Rigid3,
-    options: LocalizerOptions,
-    pose_noise: PoseNoise,
+    query: Query, latent: LatentPoints, cam_from_world: Rigid3, options: LocalizerOptions
 ) -> RefinedPose | None:
-    """Refine once more, with the anchors' poses free to move by the map's noise."""
+    """Refine once more, with the anchors' poses free to move a little."""
     chosen, view = np.unique(latent.tracks.view, return_inverse=True)
     return refine_jointly(
         cam_from_world,
@@ -325,19 +321,25 @@ def refine_with_anchors(
         query.points[latent.point],
         px=query.px,
         sigma_px=options.keypoint_sigma_px,
-        pose_noise=pose_noise,
+        pose_noise=PoseNoise(
+            options.anchor_position_noise, float(np.deg2rad(options.anchor_rotation_noise_deg))
+        ),
         max_error_px=options.max_reprojection_error_px,
     )
 
 
-def choose_pose_noise(options: LocalizerOptions, measured: PoseNoise | None) -> PoseNoise:
-    """Return the noise of a map's poses: as set, else as measured, else a guess."""
-    noise = measured or UNMEASURED
-    if options.map_position_noise is not None:
-        noise = replace(noise, position=options.map_position_noise)
-    if options.map_rotation_noise_deg is not None:
-        noise = replace(noise, rotation_rad=float(np.deg2rad(options.map_rotation_noise_deg)))
-    return noise
+def mean_distance(query: Query, latent: LatentPoints, cam_from_world: Rigid3) -> float:
+    """Return the mean distance of the anchors that see the latent points."""
+    centers = query.views[np.unique(latent.tracks.view)].center
+    return float(np.linalg.norm(centers - cam_from_world.center, axis=1).mean())
+
+
+def calibrate_covariance(
+    covariance: Array, distance: float, map_noise: PoseNoise, options: LocalizerOptions
+) -> Array:
+    """Add what all anchors have wrong together: the map's noise over their mean distance."""
+    common = np.diag(map_noise.std(np.array([distance]))[0] ** 2)
+    return options.covariance_scale * (covariance + common)
 
 
 def judge(
