@@ -67,7 +67,7 @@ class LocalizerOptions:
     covariance_scale: float = 4.0  # errors have longer tails than a normal distribution
     min_features: int = 50
     min_inliers: int = 30
-    min_inlier_ratio: float = 0.4
+    min_inlier_ratio: float = 0.5
     max_position_std_ratio: float = 0.05  # of the inliers' median depth
     max_position_std_m: float | None = None
     try_turned: bool = False  # lost frames also on their sides and upside down
