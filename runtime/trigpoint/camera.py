@@ -154,7 +154,8 @@ class Camera:
             out = cv2.undistortPoints(points, self.K, self.distortion, criteria=_UNDISTORT)
         else:
             fx, fy = self.focals_px
-            out = (points - (self._get("cx"), self._get("cy"))) / (fx, fy)
+            plain = (points[:, 0] - (self._get("cx"), self._get("cy"))) / (fx, fy)
+            return np.where(np.isfinite(plain).all(axis=1, keepdims=True), plain, np.nan)
         normalized = np.asarray(out, dtype=np.float64).reshape(-1, 2)
         # Outside the model's range OpenCV returns a point all the same, one of another pixel.
         back = self.project(np.column_stack([normalized, np.ones(len(normalized))]))
