@@ -1,4 +1,4 @@
-"""Reading a map: records are read where they lie in the mapping and converted to float32."""
+"""Reading a map: records are read where they lie in the mapping."""
 
 from __future__ import annotations
 
