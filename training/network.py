@@ -97,7 +97,11 @@ class Network(nn.Module):
         self.fuse32 = nn.Conv2d(c[4], f, 1, bias=False)
         self.fused = nn.Sequential(nn.BatchNorm2d(f), nn.ReLU(), _convolution(f, f, 3))
         zoom = 8 // profile.descriptor_stride
-        self.desc = nn.ConvTranspose2d(f, DESCRIPTOR_DIM, zoom, zoom)
+        self.desc = (
+            nn.ConvTranspose2d(f, DESCRIPTOR_DIM, zoom, zoom)
+            if zoom > 1
+            else nn.Conv2d(f, DESCRIPTOR_DIM, 1)
+        )
         # Scores are fused at stride 4; the last layer has sixteen in each cell.
         self.detect4 = nn.Conv2d(c[1], d, 1)
         self.detect8 = nn.Conv2d(f, d, 1, bias=False)
@@ -123,7 +127,9 @@ class Network(nn.Module):
         return F.pixel_shuffle(self.score(detected), 4), fused
 
     def mean_desc(self) -> nn.Conv2d:
-        """Make the layer from `fused` to the mean of the descriptors of each cell of stride 8."""
+        """Return the layer from `fused` to the mean of the descriptors of each cell of stride 8."""
+        if isinstance(self.desc, nn.Conv2d):
+            return self.desc
         weight = self.desc.weight.detach().mean(dim=(2, 3)).T
         layer = nn.Conv2d(*weight.shape[::-1], 1)
         layer.weight.data = weight[:, :, None, None].contiguous()

@@ -43,7 +43,8 @@ class GlobalHead(nn.Module):
 
     def describe(self, fused: Tensor) -> Tensor:
         """Return the descriptors of all cells (B, h w, 64), unit length."""
-        return F.normalize(self.desc(fused).flatten(2).transpose(1, 2), dim=2)
+        cells = self.desc(fused).flatten(2).transpose(1, 2)
+        return cells / cells.norm(dim=2, keepdim=True)  # F.normalize would expand the norms
 
     def vlad(self, cells: Tensor) -> Tensor:
         """Sum the residuals of (B, N, 64) to the words: (B, 64 words), normalised."""

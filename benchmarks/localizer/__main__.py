@@ -1,98 +1,142 @@
-"""Compare the localizer with hloc on real posed images.
+"""Measure the localizer on real posed images.
 
-    python -m benchmarks.localizer DATA --hloc CHECKOUT [--model base] [--only SET,...]
+    python -m benchmarks.localizer DATA [--hloc CHECKOUT] [--edgepoint2 CHECKOUT]
+        [--only accuracy,trials] [--sets fox,tnt_truck] [--output FILE] [--picture FILE]
 
 DATA holds a folder for each set, with images/, a COLMAP model in sparse/, and lists of both splits.
+hloc (https://github.com/cvg/Hierarchical-Localization) and EdgePoint2 are run from their authors'
+checkouts. Times are only worth something where nothing else runs.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections import defaultdict
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 import threadpoolctl
 
+from benchmarks.localizer import averaging, tables
 from benchmarks.localizer.comparison import Case, compare
-from trigpoint.errors import TrigpointError
+from benchmarks.localizer.networks import EdgePointModel
+from benchmarks.localizer.trials import run_trials
+from benchmarks.stage_times import describe_machine
+from trigpoint.errors import ConfigError, TrigpointError
 from trigpoint.models.features import FeatureModel
+from trigpoint.output import check_output, open_text
 from trigpoint.stages import LocalizerOptions
 
-METHODS = ("Trigpoint", "hloc")
+TABLES = ("accuracy", "averaging", "trials")
+DEFAULT = "as many as needed"
+SWEEP = (5, 10, 20, 50, 100)
 
 
-def quantile(values: list[float], share: float) -> float:
-    """Interpolate between the nearest two; inf where one of them is."""
-    return float(
-        np.quantile(values, share, method="higher" if np.isinf(values).any() else "linear")
-    )
+def at_once(num_anchors: int) -> LocalizerOptions:
+    """Take all anchors at once."""
+    return LocalizerOptions(num_anchors=num_anchors, first_anchors=num_anchors)
 
 
-def report_accuracy(cases: dict[str, list[Case]]) -> str:
-    """Print errors by set, and the geometric means of their ratios."""
-    titles = "set,queries,localized,hloc's,median,hloc's,ratio,90th percentile,hloc's,ratio"
-    lines = [f"| {titles.replace(',', ' | ')} |", "|---|" + "---:|" * 9]
-    ratios: dict[float, list[float]] = defaultdict(list)
-    for name, found in cases.items():
-        errors = {m: [case.position for case in found if case.method == m] for m in METHODS}
-        counts = [str(int(np.isfinite(errors[m]).sum())) for m in METHODS]
-        cells = [name, str(len(errors["hloc"])), *counts]
-        for share in (0.5, 0.9):
-            ours, theirs = (quantile(errors[m], share) for m in METHODS)
-            ratios[share].append(ours / theirs)
-            cells += [f"{ours:.4f}", f"{theirs:.4f}", f"{ours / theirs:.2f}"]
-        lines.append(f"| {' | '.join(cells)} |")
-    means = [float(np.exp(np.mean(np.log(ratios[share])))) for share in (0.5, 0.9)]
-    lines.append(
-        f"\nGeometric mean of the ratios: medians {means[0]:.3f}, 90th percentiles {means[1]:.3f}."
-    )
-    return "\n".join(lines)
+REFERENCE = "20 anchors"
+METHODS = {REFERENCE: at_once(20), DEFAULT: LocalizerOptions()}
+MORE_METHODS = {f"{k} anchors": at_once(k) for k in SWEEP if k != 20}
+TIMED = (DEFAULT, REFERENCE, "50 anchors")
 
 
-def report_times(cases: dict[str, list[Case]]) -> str:
-    """Print medians and 99th percentiles of the stages, over all queries."""
-    lines = ["| | stage | median (ms) | p99 (ms) |", "|---|---|---:|---:|"]
-    for method in METHODS:
-        own = [case for found in cases.values() for case in found if case.method == method]
-        stages = dict.fromkeys(stage for case in own for stage in case.stage_ms)
-        times = {s: [case.stage_ms[s] for case in own if s in case.stage_ms] for s in stages}
-        times["whole query"] = [case.ms for case in own]
-        for stage, spent in times.items():
-            lines.append(
-                f"| {method} | {stage} | {np.median(spent):.1f} | {np.quantile(spent, 0.99):.1f} |"
-            )
-    return "\n".join(lines)
+def compare_sets(
+    folders: Sequence[Path],
+    network: FeatureModel,
+    methods: Mapping[str, LocalizerOptions],
+    hloc: Path | None,
+) -> dict[str, list[Case]]:
+    """Localize both splits of all sets."""
+    cases = {}
+    for folder in folders:
+        for split in ("", "_block"):
+            name = folder.name + split.replace("_", ", ")
+            cases[name] = compare(folder, split, network, methods, hloc)
+            say(f"{name} with {network.identity.name} is done")
+    return cases
+
+
+def measure(arguments: argparse.Namespace) -> str:
+    """Measure what was asked for: Markdown."""
+    folders = find_sets(arguments.data, arguments.sets)
+    parts = [f"# The localizer\n\n{describe_machine()}"]
+    if "accuracy" in arguments.only:
+        cases = compare_sets(folders, FeatureModel.load(), METHODS | MORE_METHODS, arguments.hloc)
+        if arguments.hloc:
+            parts.append(f"## Accuracy, `base`\n\n{tables.compare_accuracy(cases, DEFAULT)}")
+        parts.append(f"## Time, `base`\n\n{tables.compare_times(cases, TIMED)}")
+        sweep = [*sorted(METHODS | MORE_METHODS, key=lambda m: (m == DEFAULT, len(m), m))]
+        parts.append(f"## Anchors\n\n{tables.compare_anchors(cases, sweep, REFERENCE)}")
+        parts.append(f"## Covariance\n\n{tables.check_coverage(cases, DEFAULT)}")
+        if arguments.picture:
+            tables.draw_reliability(cases, DEFAULT, arguments.picture)
+        if arguments.edgepoint2 and arguments.hloc:
+            with tempfile.TemporaryDirectory() as scratch:
+                network = EdgePointModel.load(arguments.edgepoint2, Path(scratch))
+                cases = compare_sets(folders, network, METHODS, arguments.hloc)
+            report = tables.compare_accuracy(cases, DEFAULT)
+            parts.append(f"## Accuracy, EdgePoint2-E64\n\n{report}")
+    if "averaging" in arguments.only:
+        parts.append(f"## Center averaging\n\n{averaging.report(folders)}")
+        say("averaging is done")
+    if "trials" in arguments.only:
+        trials = run_trials(folders, LocalizerOptions())
+        parts.append(f"## Wrong poses\n\n{tables.tabulate_trials(trials)}")
+    return "\n\n".join(parts) + "\n"
+
+
+def find_sets(data: Path, names: str | None) -> list[Path]:
+    """List the folders of the sets."""
+    if not data.is_dir():
+        raise ConfigError(f"there is no folder {data}")
+    chosen = sorted(data.iterdir()) if names is None else [data / n for n in names.split(",")]
+    folders = [folder for folder in chosen if (folder / "sparse").is_dir()]
+    if not folders or (names and len(folders) < len(chosen)):
+        raise ConfigError(f"{data} holds no such sets; each is a folder with images/ and sparse/")
+    return folders
+
+
+def say(text: str) -> None:
+    """Report progress."""
+    print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure, print, write."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+        prog="python -m benchmarks.localizer", description=__doc__.splitlines()[0]
     )
     parser.add_argument("data", type=Path)
-    parser.add_argument("--hloc", type=Path, required=True, help="a checkout of hloc")
-    parser.add_argument("--model", default="base", help="tiny, base, large, or a file")
-    parser.add_argument("--anchors", type=int, default=20)
-    parser.add_argument("--only", help="names of sets, with commas between")
+    parser.add_argument("--hloc", type=Path)
+    parser.add_argument("--edgepoint2", type=Path)
+    parser.add_argument("--only", type=_tables, default=list(TABLES))
+    parser.add_argument("--sets", help="names, with commas between")
+    parser.add_argument("--output", type=Path, help="Markdown")
+    parser.add_argument("--picture", type=Path, help="of the covariance's reliability")
     arguments = parser.parse_args()
     threadpoolctl.threadpool_limits(1, user_api="blas")
-    folders = sorted(path for path in arguments.data.iterdir() if path.is_dir())
-    if arguments.only:
-        folders = [arguments.data / name for name in arguments.only.split(",")]
     try:
-        network = FeatureModel.load(arguments.model)
-        options = LocalizerOptions(num_anchors=arguments.anchors)
-        cases = {}
-        for folder in folders:
-            for split in ("", "_block"):
-                name = folder.name + split.replace("_", ", ")
-                cases[name] = compare(folder, split, network, options, arguments.hloc)
-                print(f"{name} is done", file=sys.stderr, flush=True)
+        check_output(arguments.output)
+        check_output(arguments.picture)
+        report = measure(arguments)
+        print(report)
+        if arguments.output:
+            with open_text(arguments.output) as file:
+                file.write(report)
     except TrigpointError as error:
         sys.exit(str(error))
-    print(report_accuracy(cases), report_times(cases), sep="\n\n")
+
+
+def _tables(text: str) -> list[str]:
+    wanted = text.split(",")
+    if unknown := sorted(set(wanted) - set(TABLES)):
+        raise argparse.ArgumentTypeError(f"{unknown[0]!r} is not one of {', '.join(TABLES)}")
+    return wanted
 
 
 if __name__ == "__main__":

@@ -5,17 +5,18 @@ from __future__ import annotations
 import itertools
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from benchmarks.localizer.hloc import Hloc, write_keypoints, write_matches
 from trigpoint.database.reader import MapReader
-from trigpoint.frame import Anchor, Localized
+from trigpoint.frame import Anchor, Frame, Localized, Result, Statistics
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import Matchable, MutualNearestNeighbors
@@ -26,25 +27,50 @@ from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.poses import read_names, read_queries
 
+Array = NDArray[np.float64]
+
+HLOC = "hloc"
 NUM_NEIGHBOURS = 20  # of each anchor, those with the most matches: hloc's map is made of these
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
-    """One query, one method: errors (inf where there is no pose) and milliseconds."""
+    """One query, one method.
+
+    Parameters
+    ----------
+    method, query : str
+    position, rotation_deg : float
+        Errors; inf where there is no pose.
+    squares : (float, float)
+        Squared errors of center and rotation in units of the covariance; nan without one.
+    ms : float
+    stage_ms : dict
+    num_anchors : int
+        That were matched.
+    """
 
     method: str
     query: str
     position: float
     rotation_deg: float
+    squares: tuple[float, float]
     ms: float
     stage_ms: dict[str, float]
+    num_anchors: int
 
 
 def compare(
-    folder: Path, split: str, network: FeatureModel, options: LocalizerOptions, checkout: Path
+    folder: Path,
+    split: str,
+    network: FeatureModel,
+    methods: Mapping[str, LocalizerOptions],
+    checkout: Path | None,
 ) -> list[Case]:
-    """Localize a split's queries with both."""
+    """Localize a split's queries with each of our methods, and with hloc if there is any.
+
+    hloc gets the anchors of the first method, which must take all of them at once.
+    """
     poses = {image.name: image for image in read_model(folder / "sparse")}
     survey = select_images(list(poses.values()), read_names(folder / f"map{split}.txt"))
     cases = []
@@ -54,40 +80,72 @@ def compare(
         calibrate_map(scratch / "map.tpmap", network)
         with MapReader.open(scratch / "map.tpmap", network.identity) as reader:
             anchors = {a.name: a for a in (reader.anchor(i) for i in range(len(reader)))}
-            hloc = Hloc(checkout, scratch, list(anchors.values()), match_map(anchors))
-            localizer = Localizer(network, reader, options, time.perf_counter)
+            hloc = None
+            if checkout is not None:
+                hloc = Hloc(checkout, scratch, list(anchors.values()), match_map(anchors))
+            localizers = {
+                name: Localizer(network, reader, options, time.perf_counter)
+                for name, options in methods.items()
+            }
             queries = read_queries(folder / f"queries{split}.txt")
-            localizer.localize(
-                read_frame(folder / "images" / queries[0].name, queries[0].camera, "warm-up")
-            )
+            first = read_frame(folder / "images" / queries[0].name, queries[0].camera, "warm-up")
+            for localizer in localizers.values():
+                localizer.localize(first)
             for query in queries:
                 truth = poses[query.name].cam_from_world
                 frame = read_frame(folder / "images" / query.name, query.camera, query.name)
-                start = time.perf_counter()
-                result = localizer.localize(frame)
-                ms = (time.perf_counter() - start) * 1e3
-                pose = result.cam_from_world if isinstance(result, Localized) else None
-                stage_ms = result.statistics.stage_ms
-                cases.append(Case("Trigpoint", query.name, *errors(pose, truth), ms, stage_ms))
-
-                features, ms_features = timed(network.extract, frame.image, options.max_keypoints)
-                stage_ms = {"features": ms_features, "retrieval": stage_ms["retrieval"]}
-                matches, stage_ms["matching"] = timed(
-                    match_query,
-                    Matchable.of(features, query.camera),
-                    anchors,
-                    result.statistics.anchors,
-                )
-                files = scratch / "query.h5", scratch / "query_matches.h5"
-                write_keypoints(files[0], {query.name: features.keypoints})
-                write_matches(files[1], {(query.name, anchor): m for anchor, m in matches.items()})
-                camera = hloc.camera(query.camera.to_text())
-                pose, stage_ms["pose"] = timed(
-                    hloc.localize, query.name, camera, list(matches), *files
-                )
-                ms = sum(stage_ms.values())
-                cases.append(Case("hloc", query.name, *errors(pose, truth), ms, stage_ms))
+                results = {}
+                for name, localizer in localizers.items():
+                    results[name], ms = timed(localizer.localize, frame)
+                    cases.append(_judge(name, results[name], truth, ms, frame.name))
+                reference = results[next(iter(methods))].statistics
+                if hloc is not None:
+                    cases.append(
+                        _run_hloc(hloc, network, frame, anchors, reference, truth, scratch)
+                    )
     return cases
+
+
+def _judge(name: str, result: Result, truth: Rigid3, ms: float, query: str) -> Case:
+    statistics = result.statistics
+    pose, squares = None, (np.nan, np.nan)
+    if isinstance(result, Localized):
+        pose = result.cam_from_world
+        turn = Rotation.from_matrix(truth.R.T @ pose.R).as_rotvec()
+        squares = (
+            _square(truth.center - pose.center, result.covariance[:3, :3]),
+            _square(turn, result.covariance[3:, 3:]),
+        )
+    found = errors(pose, truth)
+    return Case(name, query, *found, squares, ms, statistics.stage_ms, statistics.num_anchors)
+
+
+def _square(error: Array, covariance: Array) -> float:
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def _run_hloc(
+    hloc: Hloc,
+    network: FeatureModel,
+    frame: Frame,
+    anchors: dict[str, Anchor],
+    reference: Statistics,
+    truth: Rigid3,
+    scratch: Path,
+) -> Case:
+    """Localize with hloc on the same features, retrieval and matches."""
+    features, ms_features = timed(network.extract, frame.image, 1024)
+    stage_ms = {"features": ms_features, "retrieval": reference.stage_ms["retrieval"]}
+    query = Matchable.of(features, frame.camera)
+    matches, stage_ms["matching"] = timed(match_query, query, anchors, reference.anchors)
+    files = scratch / "query.h5", scratch / "query_matches.h5"
+    write_keypoints(files[0], {frame.name: features.keypoints})
+    write_matches(files[1], {(frame.name, anchor): m for anchor, m in matches.items()})
+    camera = hloc.camera(frame.camera.to_text())
+    pose, stage_ms["pose"] = timed(hloc.localize, frame.name, camera, list(matches), *files)
+    ms, unknown = sum(stage_ms.values()), (np.nan, np.nan)
+    found = errors(pose, truth)
+    return Case(HLOC, frame.name, *found, unknown, ms, stage_ms, len(matches))
 
 
 def timed(function: Any, *arguments: Any) -> tuple[Any, float]:

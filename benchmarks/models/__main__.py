@@ -3,7 +3,7 @@
     python -m benchmarks.models ../shared/data [--photographs DIR] [--edgepoint2 CHECKOUT]
         [--fp32 DIR] [--model FILE] [--only pairs,speed] [--pairs N] [--jobs N] [--output FILE]
 
-DATA holds a folder for each set, as in `benchmarks/accuracy.py`; --photographs is the folder that
+DATA holds a folder for each set, as for `benchmarks.localizer`; --photographs is the folder that
 the networks were trained on, of which every tenth picture is held out. EdgePoint2 is run from its
 authors' checkout (https://github.com/HITCSC/EdgePoint2) and needs torch. The packaged networks
 always take part; --fp32 adds those named *.fp32.onnx, --model any other that `FeatureModel` loads.

@@ -1,24 +1,29 @@
-"""Localization in maps made with each network, as in `benchmarks/accuracy.py`."""
+"""Localization in maps made with each network."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.accuracy import localize
 from benchmarks.models.poses import SETS
 from benchmarks.models.scores import markdown
 from benchmarks.models.surveys import Survey
+from trigpoint.database.reader import MapReader
 from trigpoint.frame import Localized
+from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
+from trigpoint_db.build import build_map, select_images
+from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.evaluate import evaluate
-from trigpoint_db.poses import read_queries
+from trigpoint_db.importers.colmap import read_model
+from trigpoint_db.localize import Outcome, localize_images
+from trigpoint_db.poses import Query, read_names, read_queries
 
 SPLITS = ("", "_block")
-NUM_ANCHORS = 20
 
-CAPTION = f"""Position errors with {NUM_ANCHORS} anchors, in metres for 7scenes_redkitchen, else
+CAPTION = """Position errors, in metres for 7scenes_redkitchen, else
 in the model's units; failures count as infinite."""
 
 
@@ -33,8 +38,7 @@ def measure(
         truth = dict(zip(survey.names, survey.cam_from_world, strict=True))
         for split in SPLITS:
             queries = read_queries(folder / f"queries{split}.txt")
-            images = folder / "images"
-            outcomes = localize(folder, split, {images: queries}, network, NUM_ANCHORS)[images]
+            outcomes = _localize(folder, split, queries, network)
             poses = {
                 outcome.name: outcome.result.cam_from_world
                 for outcome in outcomes
@@ -44,6 +48,18 @@ def measure(
             statistics = evaluate(poses, truth, names).to_json()
             found[survey.name + split.replace("_", ", ")] = statistics
     return found
+
+
+def _localize(
+    folder: Path, split: str, queries: Sequence[Query], network: FeatureModel
+) -> list[Outcome]:
+    survey = select_images(read_model(folder / "sparse"), read_names(folder / f"map{split}.txt"))
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "map.tpmap"
+        build_map(path, survey, folder / "images", network)
+        calibrate_map(path, network)
+        with MapReader.open(path, network.identity) as reader:
+            return list(localize_images(Localizer(network, reader), queries, folder / "images"))
 
 
 def tabulate(results: dict[str, dict[str, Any]]) -> str:

@@ -114,7 +114,9 @@ def find_methods(
     Parameters
     ----------
     fp32 : Path, optional
-        Folder of our networks' files in float32, `base.fp32.onnx`.
+        Folder of our networks' files in float32, `base.fp32.onnx`, and perhaps of what
+        `trigpoint-db quantize` made of them, `base.int8.onnx`: an export has a global head of its
+        own, so that only these two can be compared through the localizer.
     checkout : Path, optional
         Of EdgePoint2.
     models : iterable of Path
@@ -136,6 +138,12 @@ def find_methods(
             raise ConfigError(f"{fp32} holds none of {', '.join(p.name for p in files.values())}")
         methods += [
             Method(f"{profile} fp32", files[profile], ours=True, variant=True) for profile in found
+        ]
+        quantized = {profile: fp32 / f"{profile}.int8.onnx" for profile in found}
+        methods += [
+            Method(f"{profile} fp32, made INT8", path, ours=True, variant=True)
+            for profile, path in quantized.items()
+            if path.is_file()
         ]
     methods += [Method(path.name, path, ours=True, retrieval=retrieval) for path in models]
     methods.append(Method("RootSIFT", max_ratio=0.8))

@@ -24,13 +24,13 @@ from trigpoint.models.matching import MutualNearestNeighbors
 from trigpoint.stages import (
     LocalizerOptions,
     find_latent_points,
-    judge,
     match_anchors,
     mean_distance,
     refine,
     refine_with_anchors,
     solve_latent_points,
 )
+from trigpoint.verdict import gather_evidence, judge
 
 NUM_IMAGES = 32
 GAPS = (0, 8, 24)  # images left out on either side
@@ -116,10 +116,12 @@ def _try_image(
     if start is None:
         return None
     latent, refined = refine(query, start, options)
-    if refined is None or judge(latent, refined, options) is not None:
-        return None
-    refined = refine_with_anchors(query, latent, refined.cam_from_world, options)
+    if refined is not None:
+        refined = refine_with_anchors(query, latent, refined.cam_from_world, options)
     if refined is None:
+        return None
+    evidence = gather_evidence(query, latent, refined, options)
+    if judge(evidence, refined.covariance, options) is not None:
         return None
     truth, pose = image.cam_from_world, refined.cam_from_world
     dtheta = Rotation.from_matrix(truth.R.T @ pose.R).as_rotvec()

@@ -229,7 +229,7 @@ def read_truth(path: Path) -> dict[str, Rigid3]:
 def info(map_: MapPath, as_json: Json = False) -> None:
     """Say what a map holds."""
     with MapReader.open(map_) as reader:
-        centers = np.array([reader.cam_from_world(i).center for i in range(len(reader))])
+        centers = np.array([reader.view(i)[1].center for i in range(len(reader))])
         facts: dict[str, Any] = {
             "map": str(map_),
             "num_images": len(reader),

@@ -139,8 +139,12 @@ class Reason(StrEnum):
     FEW_FEATURES = "FEW_FEATURES"  # the frame shows too few keypoints
     FEW_MATCHES = "FEW_MATCHES"  # no two anchors share enough of them: not a place in the map
     FEW_ANCHORS = "FEW_ANCHORS"  # fewer than two anchors agree on a pose
-    DEGENERATE_ANCHORS = "DEGENERATE_ANCHORS"  # the anchors see the frame along one line
+    DEGENERATE_ANCHORS = (
+        "DEGENERATE_ANCHORS"  # they see the frame, or what it shows, along one line
+    )
     FEW_INLIERS = "FEW_INLIERS"  # too few latent points agree with the refined pose
+    CLUSTERED_INLIERS = "CLUSTERED_INLIERS"  # those that agree lie in one place, or on one line
+    AMBIGUOUS = "AMBIGUOUS"  # another pose explains as much: a repeated structure
     HIGH_UNCERTAINTY = "HIGH_UNCERTAINTY"  # a pose was found, but not a certain one
 
 
@@ -149,12 +153,16 @@ class Statistics:
     """Counts and stage times of one localization; what was not reached is 0 or absent."""
 
     num_features: int = 0
-    num_anchors: int = 0  # retrieved
+    num_anchors: int = 0  # that were matched
     num_matches: int = 0  # over all anchors
     num_matcher_failures: int = 0  # anchors that a matching network failed on
     num_consistent_anchors: int = 0  # that agree in stage 1
+    num_candidates: int = 0  # latent points of all matches, before any pose
     num_points: int = 0  # latent points
     num_inliers: int = 0  # latent points that agree with the final pose
+    num_rivals: int = 0  # that agree with another one instead
+    spread_px: float = 0.0  # of the inliers: standard deviation where it is least
+    depth: float = 0.0  # of the inliers, the median; in the map's unit
     turned_deg: int = 0  # counterclockwise, of the image that the features are of
     generator: str = ""  # which hypothesis was refined: "anchor_pairs" or "latent_points"
     anchors: tuple[str, ...] = ()  # names, best first

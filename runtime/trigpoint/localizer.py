@@ -1,39 +1,49 @@
 """Frame in, pose out: the paper's pipeline, top to bottom.
 
-A pure function of the frame, the map's snapshot and the options. It has no clock of its own: stage
-times are measured with the caller's.
+A function of the frame, the map's snapshot and the options. It has no clock of its own: stage times
+are measured, and a deadline is kept, with the caller's.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from trigpoint.database.reader import MapReader
-from trigpoint.frame import Frame, Localized, Lost, Reason, Result, Statistics
+from trigpoint.frame import Frame, LocalFeatures, Localized, Lost, Reason, Result, Statistics
+from trigpoint.geometry.triangulation import LatentPoints
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import Matcher, MutualNearestNeighbors
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import (
     UNMEASURED,
     LocalizerOptions,
+    Query,
     average_poses,
     calibrate_covariance,
     count_support,
     estimate_relative_poses,
     extract_turned,
     find_latent_points,
-    judge,
     match_anchors,
     mean_distance,
     refine,
     refine_with_anchors,
     solve_latent_points,
 )
+from trigpoint.verdict import gather_evidence, judge, position_std, see_share
 
 MIN_CONTRAST = 2.0  # standard deviation of the gray levels
+GROWTH = 3  # each round has so many times the anchors of the one before
+NUM_LOOK_ALIKE = 20  # images that are looked at for doubles
+MAX_LESS_ALIKE = 0.1  # in cosine, than the best anchor
+MAX_DEPTHS = 10  # times the frame's median depth: from farther away nothing can be made out
+MIN_SEEN_SHARE = 0.1  # of what the frame was localized by, for an image of the same place
 
 
 class Localizer:
@@ -47,7 +57,7 @@ class Localizer:
         The map, made with the same network.
     options : LocalizerOptions, optional
     clock : callable, optional
-        Seconds, monotonic; without it the results have no stage times.
+        Seconds, monotonic; without it the results have no stage times, and there is no deadline.
     matcher : Matcher, optional
         Mutual nearest neighbours by default, and where it fails.
     """
@@ -71,19 +81,22 @@ class Localizer:
 
         With `try_turned`, a frame that is lost as it is is also tried on its sides and upside down.
         """
-        result = self._localize(frame, Statistics())
+        deadline = _Deadline(self.clock, self.options.max_latency_ms)
+        result = self._localize(frame, Statistics(), deadline)
         if isinstance(result, Localized) or not self.options.try_turned:
             return result
         if result.reason in (Reason.NO_MAP, Reason.TOO_DARK, Reason.FEW_FEATURES):
             return result
         for turned_deg in (90, 180, 270):
+            if deadline.is_over():
+                break
             start = Statistics(turned_deg=turned_deg, stage_ms=result.statistics.stage_ms)
-            turned = self._localize(frame, start)
+            turned = self._localize(frame, start, deadline)
             if isinstance(turned, Localized):
                 return turned
         return result
 
-    def _localize(self, frame: Frame, statistics: Statistics) -> Result:
+    def _localize(self, frame: Frame, statistics: Statistics, deadline: _Deadline) -> Result:
         options, trace = self.options, _Trace(self.clock, statistics)
         if len(self.reader) == 0:
             return trace.lost(Reason.NO_MAP, "the map holds no image")
@@ -99,26 +112,91 @@ class Localizer:
             return trace.lost(Reason.FEW_FEATURES, f"{len(features)} keypoints")
 
         with trace.stage("retrieval"):
-            indices, _ = self.reader.search(
+            indices, similarities = self.reader.search(
                 features.global_descriptor, options.num_anchors, options.anchor_diversity
             )
-            anchors = [self.reader.anchor(int(index)) for index in indices]
-        trace.note(num_anchors=len(anchors), anchors=tuple(anchor.name for anchor in anchors))
-
-        if len(anchors) < 2:
+        if len(indices) < 2:
             return trace.lost(Reason.FEW_ANCHORS, "the map holds a single image")
+        retrieved = dict(zip(indices.tolist(), similarities.tolist(), strict=True))
+        return self._solve_in_rounds(frame, features, retrieved, trace, deadline)
 
-        with trace.stage("matching"):
-            query = match_anchors(
-                frame.camera, features, anchors, self.matcher, self.model.long_side_px
+    def _solve_in_rounds(
+        self,
+        frame: Frame,
+        features: LocalFeatures,
+        retrieved: dict[int, float],
+        trace: _Trace,
+        deadline: _Deadline,
+    ) -> Result:
+        """Take anchors, best first, until the pose is certain, or they or the time run out.
+
+        A pose that is certain is tried once more with the images of other places that look as much
+        like the frame, if there are any.
+        """
+        options, query = self.options, None
+        waiting, taken = list(retrieved), list[int]()
+        batch = waiting[: _round_size(0, len(waiting), options.first_anchors)]
+        while True:
+            deadline.start_round()
+            with trace.stage("matching"):
+                anchors = [self.reader.anchor(index) for index in batch]
+                more = match_anchors(
+                    frame.camera, features, anchors, self.matcher, self.model.long_side_px
+                )
+                query = query.joined(more) if query else more
+            taken += batch
+            waiting = [index for index in waiting if index not in batch]
+            trace.note(
+                num_anchors=len(taken),
+                num_matches=len(query.tracks),
+                num_matcher_failures=query.num_matcher_failures,
+                anchors=trace.statistics.anchors + tuple(anchor.name for anchor in anchors),
             )
-        trace.note(num_matches=len(query.tracks), num_matcher_failures=query.num_matcher_failures)
+            solution = self._solve(query, not waiting, trace)
+            if not waiting or solution.std_ratio < options.enough_position_std_ratio:
+                with trace.stage("doubles"):
+                    batch = self._find_doubles(features, taken, retrieved, solution)
+                waiting = []
+            else:
+                batch = waiting[: _round_size(len(taken), len(waiting), options.first_anchors)]
+            if not batch or deadline.leaves_no_time(1 + len(batch) / len(taken)):
+                return solution.result
 
+    def _find_doubles(
+        self,
+        features: LocalFeatures,
+        taken: list[int],
+        retrieved: dict[int, float],
+        solution: _Solution,
+    ) -> list[int]:
+        """Find images of other places, if one of them looks as much like the frame as the anchors.
+
+        Of other places are images that do not see what the frame was localized by.
+        """
+        if solution.seen is None:
+            return []
+        points3d = solution.seen.points3d
+        support = [retrieved.get(taken[view], 0.0) for view in np.unique(solution.seen.tracks.view)]
+        found, similarities = self.reader.search(features.global_descriptor, NUM_LOOK_ALIKE)
+        num_alike = int((similarities > max(support) - MAX_LESS_ALIKE).sum())
+        elsewhere: list[int] = []
+        for i, index in enumerate(found.tolist()):
+            if i >= num_alike and not elsewhere:
+                break
+            seen = see_share(*self.reader.view(index), points3d, solution.max_distance)
+            if seen < MIN_SEEN_SHARE:
+                elsewhere.append(index)
+        return [index for index in elsewhere if index not in taken][: self.options.first_anchors]
+
+    def _solve(self, query: Query, is_last: bool, trace: _Trace) -> _Solution:
+        """Solve for the pose with the anchors there are."""
+        options = self.options
         with trace.stage("latent_points"):
             latent = find_latent_points(query, options)
-        trace.note(num_points=len(latent.point))
+        trace.note(num_points=len(latent.point), num_candidates=len(latent.point))
         if len(latent.point) < options.min_inliers:
-            return trace.lost(Reason.FEW_MATCHES, f"{len(latent.point)} points in two anchors")
+            detail = f"{len(latent.point)} points in two anchors"
+            return _Solution(trace.lost(Reason.FEW_MATCHES, detail))
 
         hypotheses: list[tuple[int, str, Rigid3]] = []  # supporters, generator, cam_from_world
         refusal = Reason.FEW_INLIERS
@@ -130,6 +208,7 @@ class Localizer:
                     hypotheses.append((support, "latent_points", solved))
         if options.generator == "anchor_pairs" or (
             options.generator == "best"
+            and is_last
             and (not hypotheses or hypotheses[0][0] < options.min_support)
         ):
             with trace.stage("relative_poses"):
@@ -143,7 +222,7 @@ class Localizer:
                     hypotheses.append((support, "anchor_pairs", averaged[0]))
                     trace.note(num_consistent_anchors=averaged[1])
         if not hypotheses:
-            return trace.lost(refusal, "no hypothesis of the pose")
+            return _Solution(trace.lost(refusal, "no hypothesis of the pose"))
 
         with trace.stage("refinement"):
             _, generator, hypothesis = max(hypotheses, key=lambda hypothesis: hypothesis[0])
@@ -152,16 +231,80 @@ class Localizer:
                 refined = refine_with_anchors(query, latent, refined.cam_from_world, options)
         trace.note(generator=generator, num_points=len(latent.point))
         if refined is None:
-            return trace.lost(Reason.FEW_INLIERS, "the latent points do not determine a pose")
-        trace.note(num_inliers=int(refined.inliers.sum()))
-        distance = mean_distance(query, latent, refined.cam_from_world)
-        map_noise = self.reader.pose_noise or UNMEASURED
-        covariance = calibrate_covariance(refined.covariance, distance, map_noise, options)
-        refined = replace(refined, covariance=covariance)
-        objection = judge(latent, refined, options)
+            detail = "the latent points do not determine a pose"
+            return _Solution(trace.lost(Reason.FEW_INLIERS, detail))
+
+        with trace.stage("verdict"):
+            evidence = gather_evidence(query, latent, refined, options)
+            trace.note(
+                num_inliers=evidence.num_inliers,
+                num_rivals=evidence.num_rivals,
+                spread_px=evidence.spread_px,
+                depth=evidence.depth,
+            )
+            covariance = calibrate_covariance(
+                refined.covariance,
+                mean_distance(query, latent, refined.cam_from_world),
+                self.reader.pose_noise or UNMEASURED,
+                options,
+            )
+            objection = judge(evidence, covariance, options)
         if objection is not None:
-            return trace.lost(*objection)
-        return Localized(refined.cam_from_world, refined.covariance, trace.statistics)
+            return _Solution(trace.lost(*objection))
+        std_ratio = position_std(refined.covariance) / evidence.depth
+        localized = Localized(refined.cam_from_world, covariance, trace.statistics)
+        return _Solution(localized, std_ratio, latent, MAX_DEPTHS * evidence.depth)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """What came of one round.
+
+    Parameters
+    ----------
+    result : Localized or Lost
+    std_ratio : float
+        The position's standard deviation, but for what is wrong with the map, over the median
+        depth; inf where it is lost.
+    seen : LatentPoints, optional
+        What it was localized by.
+    max_distance : float
+        From farther away nothing of that can be made out.
+    """
+
+    result: Result
+    std_ratio: float = math.inf
+    seen: LatentPoints | None = None
+    max_distance: float = math.inf
+
+
+def _round_size(num_taken: int, num_waiting: int, first: int) -> int:
+    """Return how many anchors are next; a last round smaller than the first joins that before."""
+    size = first if num_taken == 0 else (GROWTH - 1) * num_taken
+    return num_waiting if size + first > num_waiting else size
+
+
+class _Deadline:
+    """When an answer is due."""
+
+    def __init__(self, clock: Callable[[], float] | None, max_latency_ms: float | None) -> None:
+        self._clock = clock if max_latency_ms is not None else None
+        if self._clock is not None:
+            self._end = self._clock() + (max_latency_ms or 0.0) / 1e3
+
+    def is_over(self) -> bool:
+        return self._clock is not None and self._clock() > self._end
+
+    def start_round(self) -> None:
+        if self._clock is not None:
+            self._start = self._clock()
+
+    def leaves_no_time(self, growth: float) -> bool:
+        """Say whether a round that takes `growth` times as long as the last one would be late."""
+        if self._clock is None:
+            return False
+        now = self._clock()
+        return now + growth * (now - self._start) > self._end
 
 
 class _Trace:

@@ -28,7 +28,7 @@ from trigpoint.geometry.joint_refinement import refine_jointly
 from trigpoint.geometry.pose_refinement import RefinedPose, refine_pose, reprojection
 from trigpoint.geometry.relative_pose import estimate_relative_pose
 from trigpoint.geometry.rotation_averaging import average_rotations
-from trigpoint.geometry.triangulation import LatentPoints, Tracks, triangulate_robust
+from trigpoint.geometry.triangulation import LatentPoints, Tracks, keep_agreeing, triangulate_robust
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import Matchable, Matcher, MutualNearestNeighbors
 from trigpoint.rigid import Rigid3
@@ -43,7 +43,10 @@ UNMEASURED = PoseNoise(0.005, 0.001)  # of a map that does not say: better too l
 class LocalizerOptions:
     """Settings of the localizer; pixels are those of the image as the network sees it."""
 
-    num_anchors: int = 20
+    num_anchors: int = 20  # at the most
+    first_anchors: int = 6  # more follow where these leave the pose uncertain
+    enough_position_std_ratio: float = 0.002  # of the inliers' median depth: certain
+    max_latency_ms: float | None = None  # no more anchors where they would take longer
     anchor_diversity: float = 0.3  # of the likeness to a better anchor, taken off; see search
     max_keypoints: int = 1024
     # "best": latent points first; anchor pairs too where these have few supporters
@@ -68,6 +71,9 @@ class LocalizerOptions:
     min_features: int = 50
     min_inliers: int = 30
     min_inlier_ratio: float = 0.5
+    max_rival_ratio: float = 0.3  # of the inliers: points that agree on another pose
+    min_spread_px: float = 10.0  # of the inliers, standard deviation
+    max_depth_std_ratio: float = 0.2  # of the inliers' distances, the median
     max_position_std_ratio: float = 0.05  # of the inliers' median depth
     max_position_std_m: float | None = None
     try_turned: bool = False  # lost frames also on their sides and upside down
@@ -75,6 +81,8 @@ class LocalizerOptions:
     def __post_init__(self) -> None:
         if self.num_anchors < 2:
             raise ConfigError("num_anchors must be at least 2: one anchor does not tell the scale")
+        if self.first_anchors < 2:
+            raise ConfigError("first_anchors must be at least 2: one anchor tells no depth")
         for name, value in vars(self).items():
             if isinstance(value, bool) or name == "anchor_diversity":
                 continue
@@ -118,6 +126,23 @@ class Query:
     matches: list[Index]
     anchor_points: list[Array]
     num_matcher_failures: int
+
+    def joined(self, other: Query) -> Query:
+        """Add the anchors that the same keypoints are matched with in another query."""
+        theirs = replace(other.tracks, view=other.tracks.view + len(self.views))
+        return Query(
+            self.points,
+            self.px,
+            Rigid3(
+                np.concatenate([self.views.R, other.views.R]),
+                np.concatenate([self.views.t, other.views.t]),
+            ),
+            np.concatenate([self.views_px, other.views_px]),
+            Tracks.concatenate([self.tracks, theirs]),
+            self.matches + other.matches,
+            self.anchor_points + other.anchor_points,
+            self.num_matcher_failures + other.num_matcher_failures,
+        )
 
 
 def extract_turned(
@@ -248,9 +273,9 @@ def average_poses(
 
 def find_latent_points(query: Query, options: LocalizerOptions) -> LatentPoints:
     """Latent points of all matches, by their linear estimate: that is enough for a hypothesis."""
-    return triangulate_robust(
-        query.views, query.tracks, max_error_px=options.max_ray_error_px, num_iterations=0
-    )
+    limit = options.max_ray_error_px
+    tracks = keep_agreeing(query.views, query.tracks, max_error_px=limit)
+    return triangulate_robust(query.views, tracks, max_error_px=limit, num_iterations=0)
 
 
 def solve_latent_points(
@@ -278,19 +303,23 @@ def count_support(
     return int((near & in_front).sum())
 
 
-def guide_matches(query: Query, cam_from_world: Rigid3, max_error_px: float) -> Tracks:
-    """Keep the matches within `max_error_px` of the epipolar geometry of a hypothesis."""
+def follows_epipolar_lines(
+    query: Query, cam_from_world: Rigid3, max_error_px: float
+) -> NDArray[np.bool_]:
+    """Say which matches (P,) are within `max_error_px` of the epipolar geometry of a pose."""
     E = essential_matrix(cam_from_world @ query.views.inverse())
     tracks = query.tracks
     errors = sampson_error(E[tracks.view], tracks.xy, query.points[tracks.point])
-    return tracks[np.abs(errors) < max_error_px * mean_px(query, tracks.view)]
+    near: NDArray[np.bool_] = np.abs(errors) < max_error_px * mean_px(query, tracks.view)
+    return near
 
 
 def refine(
     query: Query, cam_from_world: Rigid3, options: LocalizerOptions
 ) -> tuple[LatentPoints, RefinedPose | None]:
     """Stage 2 of the paper: guided matches, latent points (E1), pose (E2)."""
-    tracks = guide_matches(query, cam_from_world, options.max_guided_error_px)
+    guided = follows_epipolar_lines(query, cam_from_world, options.max_guided_error_px)
+    tracks = query.tracks[guided]
     num_matches = np.bincount(tracks.view, minlength=len(query.views))
     chosen = np.argsort(-num_matches, kind="stable")[: options.num_refined_anchors]
     tracks = tracks[np.isin(tracks.view, chosen)]
@@ -340,18 +369,3 @@ def calibrate_covariance(
     """Add what all anchors have wrong together: the map's noise over their mean distance."""
     common = np.diag(map_noise.std(np.array([distance]))[0] ** 2)
     return options.covariance_scale * (covariance + common)
-
-
-def judge(
-    latent: LatentPoints, refined: RefinedPose, options: LocalizerOptions
-) -> tuple[Reason, str] | None:
-    """Say why a refined pose must not be used, or None."""
-    num_inliers, num_points = int(refined.inliers.sum()), len(latent.point)
-    if num_inliers < max(options.min_inliers, options.min_inlier_ratio * num_points):
-        return Reason.FEW_INLIERS, f"{num_inliers} of {num_points} latent points agree"
-    std = float(np.sqrt(np.linalg.eigvalsh(refined.covariance[:3, :3])[-1]))
-    depth = float(np.median(refined.cam_from_world.apply(latent.points3d[refined.inliers])[:, 2]))
-    limit = min(options.max_position_std_ratio * depth, options.max_position_std_m or np.inf)
-    if std > limit:
-        return Reason.HIGH_UNCERTAINTY, f"position to {std:.3g}, the limit is {limit:.3g}"
-    return None

@@ -71,7 +71,7 @@ def test_from_images_to_numbers(run: Run, place: Path) -> None:
     assert code == 0
     assert json.loads(out) == {"num_queries": 3, "outcomes": {"LOCALIZED": 3}}
     results = [json.loads(line) for line in (place / "results.jsonl").read_text().splitlines()]
-    assert [result["num_anchors"] for result in results] == [10, 10, 10]
+    assert all(6 <= result["num_anchors"] <= 10 for result in results)
     code, out, _ = run(
         "evaluate", "--poses", place / "poses.txt", "--truth", place / "sparse",
         "--queries", place / "queries.txt", "--json",

@@ -237,7 +237,7 @@ def test_searching_for_another_networks_descriptor_is_an_error(tmp_path: Path) -
         with pytest.raises(DatabaseError, match="no image 1 among 1"):
             reader.anchor(1)
         with pytest.raises(DatabaseError, match="no image -1 among 1"):
-            reader.cam_from_world(-1)
+            reader.view(-1)
 
 
 def test_readers_and_a_writer_of_one_process_share_the_map(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The pipeline on the rendered room: what is found, what is refused, and why."""
 
+import itertools
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -82,6 +83,32 @@ def test_stage_times_are_measured_with_the_callers_clock(
     assert untimed.statistics.stage_ms == {}
 
 
+def num_anchors(
+    model: FeatureModel, reader: MapReader, frame: Frame, seconds_a_tick: float, **changes: float
+) -> int:
+    """How many anchors a frame takes, by a clock that ticks each time it is read."""
+    ticks = itertools.count()
+    options = LocalizerOptions(**changes)  # type: ignore[arg-type]
+    localizer = Localizer(model, reader, options, lambda: next(ticks) * seconds_a_tick)
+    result = localizer.localize(frame)
+    assert isinstance(result, Localized), describe(result)
+    assert len(result.statistics.anchors) == result.statistics.num_anchors
+    return result.statistics.num_anchors
+
+
+def test_anchors_are_added_until_the_pose_is_certain_or_the_time_is_up(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    frame = flight[0][0]
+    assert num_anchors(model, reader, frame, 0.001) == 6
+    assert num_anchors(model, reader, frame, 0.001, first_anchors=20) == 20
+    never: dict[str, float] = {"enough_position_std_ratio": 2e-6}
+    assert num_anchors(model, reader, frame, 0.001, **never) == 20
+    assert num_anchors(model, reader, frame, 0.001, max_latency_ms=1000, **never) == 20
+    assert num_anchors(model, reader, frame, 0.001, max_latency_ms=20, **never) == 6
+    assert num_anchors(model, reader, frame, 10.0, max_latency_ms=1, **never) == 6
+
+
 def reason(result: object) -> Reason:
     assert isinstance(result, Lost)
     return result.reason
@@ -154,7 +181,13 @@ def test_a_frame_of_another_size_than_its_camera_is_an_error() -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"num_anchors": 1}, {"min_inliers": 0}, {"min_inlier_ratio": 40}, {"anchor_diversity": -1}],
+    [
+        {"num_anchors": 1},
+        {"min_inliers": 0},
+        {"min_inlier_ratio": 40},
+        {"anchor_diversity": -1},
+        {"first_anchors": 1},
+    ],
 )
 def test_settings_out_of_range_are_errors(changes: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=next(iter(changes))):

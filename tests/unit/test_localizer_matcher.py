@@ -63,7 +63,7 @@ def test_where_the_network_fails_mutual_nearest_neighbours_do(
     path = graphs.failing_matcher(tmp_path / "failing.onnx", dim, metadata=contract.to_json())
     ours = localized(Localizer(model, reader), frame)
     failing = localized(Localizer(model, reader, matcher=OnnxMatcher.load(path, dim)), frame)
-    assert failing.statistics.num_matcher_failures == failing.statistics.num_anchors == 20
+    assert failing.statistics.num_matcher_failures == failing.statistics.num_anchors >= 6
     assert ours.statistics.num_matcher_failures == 0
     np.testing.assert_array_equal(failing.cam_from_world.t, ours.cam_from_world.t)
     np.testing.assert_array_equal(failing.covariance, ours.covariance)

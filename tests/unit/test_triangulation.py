@@ -11,6 +11,7 @@ from trigpoint.geometry.epipolar import homogeneous
 from trigpoint.geometry.triangulation import (
     Tracks,
     intersect_rays,
+    keep_agreeing,
     project_tracks,
     triangulate,
     triangulate_robust,
@@ -167,6 +168,25 @@ def test_wrong_observations_are_dropped_and_the_others_kept() -> None:
     assert kept[~wrong].mean() > 0.9
     errors = np.linalg.norm(latent.points3d - scene.points3d[latent.point], axis=1)
     assert np.median(errors) < 5e-3
+
+
+def test_of_two_places_that_look_alike_the_observations_of_one_are_kept() -> None:
+    """Three views show the points, two show copies of them elsewhere, one something else."""
+    scene = make_scene("copies", num_points=60, num_views=6)
+    views = scene.views_from_world
+    moved = views.center + np.outer([0, 0, 0, 1, 1, 0], [40.0, 3.0, 0])
+    views = Rigid3.from_center(views.R, moved)
+    seen = scene.points2d + generator("copies").normal(0, 1e-3, scene.points2d.shape)
+    seen[5] = generator("something else").uniform(-0.4, 0.4, seen[5].shape)
+    tracks = all_tracks(seen)
+    kept = keep_agreeing(views, replace(tracks, px=np.full(len(tracks), 2e-3)), max_error_px=2.0)
+    num_kept = np.bincount(kept.view, minlength=6)
+    assert (num_kept[:3] >= 55).all()
+    assert (num_kept[3:] < 15).all()
+    latent = triangulate_robust(views, replace(kept, px=np.full(len(kept), 2e-3)), max_error_px=2.0)
+    errors = np.linalg.norm(latent.points3d - scene.points3d[latent.point], axis=1)
+    assert len(errors) >= 50
+    assert np.median(errors) < 0.05
 
 
 def test_points_seen_once_are_left_out() -> None:

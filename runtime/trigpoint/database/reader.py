@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from trigpoint.camera import Camera
 from trigpoint.database import schema
 from trigpoint.database.pages import DamageError
 from trigpoint.database.ranking import POOL, choose_diverse, find_largest
@@ -77,10 +78,11 @@ class MapReader:
             images = (snapshot.get(schema.image_key(index)) for index in range(len(self)))
             return [schema.decode_name(image) for image in images]
 
-    def cam_from_world(self, index: int) -> Rigid3:
-        """Return the pose of an image."""
+    def view(self, index: int) -> tuple[Camera, Rigid3]:
+        """Return the camera of an image and its pose, cam_from_world."""
         with self._reading() as snapshot:
-            return _image(snapshot, index).cam_from_world
+            image = _image(snapshot, index)
+            return image.camera, image.cam_from_world
 
     def anchor(self, index: int) -> Anchor:
         """Return an image with its features."""

@@ -84,22 +84,25 @@ def average_centers(
 def average_centers_robust(
     centers: Array, directions: Array, *, num_iterations: int = 50, tolerance: float = 1e-3
 ) -> Array | None:
-    """Return the point with the least sum of distances, not squared, to the lines.
+    """Return the point with the least sum of angles, not of squared distances, from the lines.
 
-    Minimises  sum_k sqrt(|P_k (c - c_k)|^2 + eps^2)  by iteratively reweighted least squares
-    (Weiszfeld, 1937), from Proposition 1. A direction's error moves its line in proportion to
-    the anchor's distance, so that in least squares the far anchors dominate, the more anchors
-    the more so, and a single wrong one moves the center at will.
+    It is the directions that err, all alike, and some altogether. A direction's error moves its
+    line in proportion to the anchor's distance, so that by squared distances the far anchors
+    dominate, the more anchors the more so, and a single wrong one moves the center at will.
+    Minimises  sum_k sqrt(s_k^2 + eps^2)  with the sines  s_k = |P_k (c - c_k)| / |c - c_k|  by
+    iteratively reweighted least squares (Weiszfeld, 1937), from the point with the least sum of
+    distances, which is a single one, and that from Proposition 1.
 
     Parameters
     ----------
     centers, directions : (K, 3) float64
         As in `average_centers`.
     num_iterations : int
-        Reweighted solutions at most; the last one counts if they have not settled.
+        Reweighted solutions at most, of both sums; the last one counts if they have not settled.
     tolerance : float
-        The length eps that rounds off the cost where a distance is zero, as a fraction of the
-        rms distance of the anchors from their centroid. A step below a tenth of it is the last.
+        What rounds off the cost where it is zero: eps in radians, and for distances as a fraction
+        of the rms distance of the anchors from their centroid. A step below a tenth of that is the
+        last.
 
     Returns
     -------
@@ -109,15 +112,21 @@ def average_centers_robust(
     center = average_centers(centers, directions)
     if center is None:
         return None
-    eps = tolerance * math.sqrt(centers.var(axis=0).sum())
-    if eps == 0.0:  # anchors at one place: every line goes through it
+    resolution = tolerance * math.sqrt(centers.var(axis=0).sum())
+    if resolution == 0.0:  # anchors at one place: every line goes through it
         return center
-    for _ in range(num_iterations):
-        previous = center
-        weights = 1.0 / np.hypot(line_distances(center, centers, directions), eps)
-        center = nearest_point_to_lines(centers, directions, weights)
-        if math.dist(center, previous) < 0.1 * eps:
-            break
+    for by_angle in (False, True):
+        for _ in range(num_iterations):
+            previous = center
+            distances = line_distances(center, centers, directions)
+            if by_angle:
+                ranges = np.maximum(np.linalg.norm(center - centers, axis=1), resolution)
+                weights = 1.0 / (ranges * np.hypot(distances, tolerance * ranges))
+            else:
+                weights = 1.0 / np.hypot(distances, resolution)
+            center = nearest_point_to_lines(centers, directions, weights)
+            if math.dist(center, previous) < 0.1 * resolution:
+                break
     return center
 
 

@@ -206,26 +206,30 @@ class _Problem:
         square = np.where(in_front, (r**2).sum(axis=1) / sigma**2, 1e12)
         weight = 1 / (1 + square / CAUCHY**2)
         root = (np.sqrt(weight) / sigma)[:, None, None]
-        r, B = r * root[:, :, 0], B * root
         by_error: Array = A * (root * self.view_std[tracks.view][:, None, :])
-        B_transposed = np.swapaxes(B, 1, 2)
+        B = B * root
+        rows = np.concatenate([B, by_error, r[:, :, None] * root], axis=2)  # (P, 2, 3 + 6 + 1)
+        # What each observation adds to its point's equations: the sum over its two rows.
+        products = B[:, 0, :, None] * rows[:, 0, None, :] + B[:, 1, :, None] * rows[:, 1, None, :]
 
-        H = np.add.reduceat(B_transposed @ B, starts)
+        sums = np.add.reduceat(products[:, :, [0, 1, 2, 9]], starts)
+        H, g = sums[:, :, :3], sums[:, :, 3]
         trace = np.trace(H, axis1=1, axis2=2)  # rays that are nearly parallel leave H singular
         C = invert_symmetric(H + (1e-9 * (trace + np.median(trace)))[:, None, None] * np.eye(3))
-        step = -rotate(C, np.add.reduceat(rotate(B_transposed, r), starts))
+        step = -rotate(C, g)
         mixed = np.zeros((num_points, 3, num_views, 6))
-        mixed[index, :, tracks.view] = B_transposed @ by_error
+        mixed[index, :, tracks.view] = products[:, :, 3:9]
         gain = C @ mixed.reshape(num_points, 3, -1)
 
         flat = mixed.reshape(3 * num_points, -1)
         information = -flat.T @ gain.reshape(flat.shape)
         gradient = flat.T @ step.ravel()
         for view in range(num_views):
-            own, block = tracks.view == view, slice(6 * view, 6 * view + 6)
-            a = by_error[own].reshape(-1, 6)
-            information[block, block] += a.T @ a
-            gradient[block] += a.T @ r[own].ravel()
+            block = slice(6 * view, 6 * view + 6)
+            own = rows[tracks.view == view, :, 3:].reshape(-1, 7)
+            sums = own[:, :6].T @ own
+            information[block, block] += sums[:, :6]
+            gradient[block] += sums[:, 6]
         return _Points(C, step, gain, information, gradient, square, weight)
 
 

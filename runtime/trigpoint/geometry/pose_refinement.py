@@ -136,7 +136,7 @@ def refine_pose(
         candidate = perturb(cam_from_world, step)
         new = evaluate(candidate)
         if new[0] <= cost:
-            converged = cost - new[0] < 1e-6 * (1 + cost)
+            converged = cost - new[0] < 1e-3 * (1 + cost)
             cam_from_world, (cost, r, J, square, inliers) = candidate, new
             damping = max(damping / 10, 1e-9)
             if converged:

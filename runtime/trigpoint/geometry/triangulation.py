@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trigpoint.geometry.epipolar import homogeneous
+from trigpoint.geometry.epipolar import essential_matrix, homogeneous, sampson_error
 from trigpoint.rigid import Rigid3, rotate
 
 Array = NDArray[np.float64]
@@ -38,13 +39,27 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.point)
 
-    def __getitem__(self, index: NDArray[np.generic]) -> Tracks:
+    def __getitem__(self, index: slice | NDArray[np.generic]) -> Tracks:
         return Tracks(self.point[index], self.view[index], self.xy[index], self.px[index])
 
     def groups(self) -> tuple[Index, Index]:
         """Return the points that occur (M,) and where each one's observations start (M,)."""
         starts = np.flatnonzero(np.diff(self.point, prepend=-1))
         return self.point[starts], starts
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Tracks]) -> Tracks:
+        """Put tracks together, by point; the observations of one point in the order of the parts.
+
+        At least one part.
+        """
+        joined = cls(
+            np.concatenate([part.point for part in parts]),
+            np.concatenate([part.view for part in parts]),
+            np.concatenate([part.xy for part in parts]),
+            np.concatenate([part.px for part in parts]),
+        )
+        return joined[np.argsort(joined.point, kind="stable")]
 
     def of_length(self, min_length: int) -> Tracks:
         """Keep the points with at least so many observations."""
@@ -203,8 +218,45 @@ def triangulate(
     return X, np.linalg.inv(regular(H)).astype(np.float64, copy=False)
 
 
+def keep_agreeing(views_from_world: Rigid3, tracks: Tracks, *, max_error_px: float) -> Tracks:
+    """Keep, of each point, the observation that agrees with the most others, and these.
+
+    Two observations agree that are within `max_error_px` of each other's epipolar lines. Where a
+    point's observations are of two places, as in a repeated structure, those of one are left; from
+    all of them together no point could be triangulated that is near any.
+    """
+    tracks = tracks.of_length(2)
+    if len(tracks) == 0:
+        return tracks
+    num, (_, starts) = len(tracks), tracks.groups()
+    lengths = np.diff(starts, append=num)
+    # Each observation with those of its point that come after it.
+    index = np.arange(num)
+    following = np.repeat(starts + lengths, lengths) - index - 1
+    a = np.repeat(index, following)
+    b = a + 1 + np.arange(len(a)) - np.repeat(np.cumsum(following) - following, following)
+    pair = tracks.view[b] * len(views_from_world) + tracks.view[a]
+    pairs, which = np.unique(pair, return_inverse=True)
+    view_b, view_a = np.divmod(pairs, len(views_from_world))
+    E = essential_matrix(views_from_world[view_b] @ views_from_world[view_a].inverse())
+    errors = np.abs(sampson_error(E[which], tracks.xy[a], tracks.xy[b]))
+    agree = errors < max_error_px * np.sqrt((tracks.px[a] ** 2 + tracks.px[b] ** 2) / 2)
+    a, b = a[agree], b[agree]
+
+    votes = np.bincount(a, minlength=num) + np.bincount(b, minlength=num)
+    most = np.maximum.reduceat(votes, starts)
+    candidates = np.flatnonzero(votes == np.repeat(most, lengths))
+    leader = candidates[np.searchsorted(candidates, starts)]  # of each point, the first of them
+    own_leader = np.repeat(leader, lengths)
+    kept = np.zeros(num, bool)
+    kept[leader] = True
+    kept[b[own_leader[a] == a]] = True
+    kept[a[own_leader[b] == b]] = True
+    return tracks[kept]
+
+
 def triangulate_robust(
-    views_from_world: Rigid3, tracks: Tracks, *, max_error_px: float, num_iterations: int = 3
+    views_from_world: Rigid3, tracks: Tracks, *, max_error_px: float, num_iterations: int = 1
 ) -> LatentPoints:
     """Triangulate points whose observations may be wrong.
 
@@ -214,7 +266,7 @@ def triangulate_robust(
     """
     active = tracks.of_length(2)
     equations = _ray_equations(views_from_world, active)
-    settled: list[Tracks] = []
+    settled = [active[:0]]
     while len(active):
         _, starts = active.groups()
         lengths = np.diff(starts, append=len(active))
@@ -230,20 +282,6 @@ def triangulate_robust(
         is_worst = errors == np.repeat(worst, lengths)
         left = active.in_groups_of(2, ~done & ~is_worst)
         active, equations = active[left], equations[left]
-    kept = _concatenate(settled)
+    kept = Tracks.concatenate(settled)
     points3d, covariance = triangulate(views_from_world, kept, num_iterations=num_iterations)
     return LatentPoints(kept.groups()[0], points3d, covariance, kept)
-
-
-def _concatenate(parts: list[Tracks]) -> Tracks:
-    if not parts:
-        none = np.empty(0, np.intp)
-        return Tracks(none, none, np.empty((0, 2)), np.empty(0))
-    point = np.concatenate([part.point for part in parts])
-    order = np.argsort(point, kind="stable")
-    return Tracks(
-        point[order],
-        np.concatenate([part.view for part in parts])[order],
-        np.concatenate([part.xy for part in parts])[order],
-        np.concatenate([part.px for part in parts])[order],
-    )
