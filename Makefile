@@ -9,7 +9,7 @@ KITCHEN := $(DATA)/7scenes_redkitchen
 # Everyday pictures without poses, a tenth of which no training sees.
 PHOTOGRAPHS := ../shared/train_images/images
 
-.PHONY: demo test check golden bench bench-models wheel-test clean
+.PHONY: demo test check golden bench bench-models bench-localizer wheel-test clean
 
 # uv where it is installed, else venv and pip.
 $(READY): pyproject.toml
@@ -65,6 +65,16 @@ bench-models: $(READY)
 	  $(if $(wildcard $(PHOTOGRAPHS)),--photographs $(PHOTOGRAPHS)) \
 	  $(if $(EDGEPOINT2),--edgepoint2 '$(EDGEPOINT2)') $(if $(FP32),--fp32 '$(FP32)') \
 	  --output build/bench/models.md --json build/bench/models.json
+
+# The localizer: accuracy and speed beside hloc where its checkout is named (it needs the extra
+# `colmap`, h5py, tqdm and packaging), the K sweep, the covariance, wrong poses, memory:
+# make bench-localizer HLOC=../Hierarchical-Localization EDGEPOINT2=../EdgePoint2
+bench-localizer: $(READY)
+	@mkdir -p build/bench
+	$(BIN)/python -m benchmarks.localizer $(DATA) \
+	  $(if $(HLOC),--hloc '$(HLOC)') $(if $(EDGEPOINT2),--edgepoint2 '$(EDGEPOINT2)') \
+	  --output build/bench/localizer.md --picture build/bench/reliability.png
+	$(BIN)/python -m benchmarks.localizer.memory
 
 # The suite against the installed wheel, not the checkout.
 wheel-test: $(READY)

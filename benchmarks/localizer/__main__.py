@@ -19,7 +19,7 @@ from pathlib import Path
 
 import threadpoolctl
 
-from benchmarks.localizer import averaging, tables
+from benchmarks.localizer import averaging, confidence, tables
 from benchmarks.localizer.comparison import Case, compare
 from benchmarks.localizer.networks import EdgePointModel
 from benchmarks.localizer.trials import run_trials
@@ -85,8 +85,9 @@ def measure(arguments: argparse.Namespace) -> str:
         parts.append(f"## Center averaging\n\n{averaging.report(folders)}")
         say("averaging is done")
     if "trials" in arguments.only:
-        trials = run_trials(folders, LocalizerOptions())
+        trials = run_trials(folders, LocalizerOptions(min_confidence=1e-5))
         parts.append(f"## Wrong poses\n\n{tables.tabulate_trials(trials)}")
+        parts.append(f"## Confidence\n\n{confidence.report(trials)}")
     return "\n\n".join(parts) + "\n"
 
 

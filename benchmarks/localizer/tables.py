@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import beta, chi2
 
 from benchmarks.localizer.comparison import HLOC, Case
-from benchmarks.localizer.trials import Trial
+from benchmarks.localizer.trials import NOT_OF_THIS_WORLD, Trial
 from benchmarks.models.scores import markdown
 
 Array = NDArray[np.float64]
@@ -157,18 +157,25 @@ def upper_bound(count: int, total: int) -> float:
 
 def tabulate_trials(trials: Sequence[Trial]) -> str:
     """Count poses given, and wrong ones among them, by the state of the frame."""
-    rows = []
+
+    def count(name: str, own: Sequence[Trial]) -> list[str]:
+        given = [trial for trial in own if trial.is_given]
+        wrong = sum(not trial.is_right for trial in given)
+        lost = sum(trial.is_right and not trial.is_given for trial in own)
+        return [name, f"{len(own)}", f"{len(given)}", f"{wrong}", f"{lost}"]
+
+    possible = [trial for trial in trials if trial.kind not in NOT_OF_THIS_WORLD]
     kinds = dict.fromkeys(trial.kind for trial in trials)
-    for kind in [*kinds, "all"]:
-        own = [trial for trial in trials if kind in (trial.kind, "all")]
-        posed = [trial for trial in own if trial.is_posed]
-        wrong = sum(not trial.is_right for trial in posed)
-        rows.append([kind, f"{len(own)}", f"{len(posed)}", f"{wrong}"])
-    posed = [trial for trial in trials if trial.is_posed]
-    wrong = sum(not trial.is_right for trial in posed)
-    bounds = (upper_bound(wrong, len(posed)), upper_bound(wrong, len(trials)))
+    rows = [count(kind, [trial for trial in trials if trial.kind == kind]) for kind in kinds]
+    rows.sort(key=lambda row: row[0] in NOT_OF_THIS_WORLD)
+    others = " and ".join(NOT_OF_THIS_WORLD)
+    rows.append(count(f"all but {others}", possible))
+    given = [trial for trial in possible if trial.is_given]
+    wrong = sum(not trial.is_right for trial in given)
+    bounds = (upper_bound(wrong, len(given)), upper_bound(wrong, len(possible)))
+    header = ["frame", "trials", "pose given", "wrong", "right ones refused"]
     return (
-        f"{markdown(['frame', 'trials', 'posed', 'wrong'], rows)}\n\n"
-        f"Wrong among the poses given: {wrong} of {len(posed)}, at most {bounds[0]:.2%} with 95 % "
-        f"confidence; among all trials at most {bounds[1]:.2%}."
+        f"{markdown(header, rows)}\n\n"
+        f"Without {others}, wrong among the poses given: {wrong} of {len(given)}, at most "
+        f"{bounds[0]:.2%} with 95 % confidence; among all trials at most {bounds[1]:.2%}."
     )

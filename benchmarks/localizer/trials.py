@@ -65,9 +65,19 @@ class Trial:
         return self.position < WRONG_POSITION and self.rotation_deg < WRONG_ROTATION_DEG
 
     @property
+    def confidence(self) -> float:
+        """The confidence in its pose."""
+        return self.statistics.confidence
+
+    @property
     def is_posed(self) -> bool:
-        """Whether a pose was given."""
+        """Whether there is a pose, with whatever confidence."""
         return self.verdict == "LOCALIZED"
+
+    @property
+    def is_given(self) -> bool:
+        """Whether the localizer gives a pose with its default options."""
+        return self.is_posed and self.confidence >= LocalizerOptions().min_confidence
 
 
 def black(image: Image, _: Generator) -> Image:
@@ -156,6 +166,8 @@ SPOILT: dict[str, Callable[[Image, Generator], Image]] = {
 IMPOSSIBLE: dict[str, Callable[[Image, Generator], Image]] = {
     function.__name__: function for function in (black, white, noise, mirrored, shuffled)
 }
+# No camera sees these; they show what a verdict by the matches alone can do.
+NOT_OF_THIS_WORLD = ("mirrored", "shuffled")
 ROLLS_DEG = (30, 90, 180)
 
 

@@ -8,6 +8,7 @@ are likeliest is the map's.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,13 +31,16 @@ from trigpoint.stages import (
     refine_with_anchors,
     solve_latent_points,
 )
-from trigpoint.verdict import gather_evidence, judge
+from trigpoint.verdict import gather_evidence, judge, measure_confidence
+
+Array = NDArray[np.float64]
 
 NUM_IMAGES = 32
 GAPS = (0, 8, 24)  # images left out on either side
 MIN_TRIALS = 10
-POSITION = (0.0, *(0.0005 * 2**k for k in range(9)))  # to 13 % of the distance
-ROTATION_RAD = (0.0, *(0.0001 * 2**k for k in range(9)))
+# Grids of standard deviations: to 13 % of the anchors' distance, and 1.5 degrees.
+POSITION = np.append(0.0, 0.0005 * 2.0 ** np.arange(9))
+ROTATION_RAD = np.append(0.0, 0.0001 * 2.0 ** np.arange(9))
 STUDENT_DOF = 4.0  # errors have long tails: those of wrong poses must not set the noise
 
 
@@ -44,8 +48,8 @@ STUDENT_DOF = 4.0  # errors have long tails: those of wrong poses must not set t
 class Trial:
     """One image of the map, localized against others."""
 
-    error: NDArray[np.float64]  # (6,): (dc, dtheta), as of `Localized`
-    covariance: NDArray[np.float64]  # (6, 6): without the map's noise
+    error: Array  # (6,): (dc, dtheta), as of `Localized`
+    covariance: Array  # (6, 6): without the map's noise
     distance: float  # of the anchors, in the mean
 
 
@@ -77,22 +81,20 @@ def measure_pose_noise(
     errors = np.array([trial.error for trial in trials])
     covariances = np.array([trial.covariance for trial in trials])
     distances = np.array([trial.distance for trial in trials])
-    center, rotation = slice(0, 3), slice(3, 6)
-    return PoseNoise(
-        min(
-            POSITION,
-            key=lambda share: _surprise(
-                errors[:, center], covariances[:, center, center], share * distances
-            ),
-        ),
-        min(
-            ROTATION_RAD,
-            key=lambda angle: _surprise(
-                errors[:, rotation],
-                covariances[:, rotation, rotation],
-                np.full_like(distances, angle),
-            ),
-        ),
+    parts = slice(0, 3), slice(3, 6)
+    middle = float(np.median(distances))
+    position, rotation = (
+        _fit(errors[:, part], covariances[:, part, part], distances / middle, levels)
+        for part, levels in zip(parts, (middle * POSITION, ROTATION_RAD), strict=True)
+    )
+    return PoseNoise(position[0], position[1] / middle, rotation[0], rotation[1] / middle)
+
+
+def _fit(errors: Array, covariances: Array, distances: Array, levels: Array) -> tuple[float, float]:
+    """Return the standard deviation at no distance, and what a unit of distance adds."""
+    return min(
+        itertools.product(levels.tolist(), levels.tolist()),
+        key=lambda std: _surprise(errors, covariances, np.hypot(std[0], std[1] * distances)),
     )
 
 
@@ -110,7 +112,8 @@ def _try_image(
     anchors = [reader.anchor(int(other)) for other in others]
     query = match_anchors(image.camera, features, anchors, MutualNearestNeighbors(), long_side_px)
     latent = find_latent_points(query, options)
-    if len(latent.point) < options.min_inliers:
+    num_candidates = len(latent.point)
+    if num_candidates < options.min_inliers:
         return None
     start = solve_latent_points(query, latent, options)
     if start is None:
@@ -120,8 +123,9 @@ def _try_image(
         refined = refine_with_anchors(query, latent, refined.cam_from_world, options)
     if refined is None:
         return None
-    evidence = gather_evidence(query, latent, refined, options)
-    if judge(evidence, refined.covariance, options) is not None:
+    evidence = gather_evidence(query, num_candidates, latent, refined, options)
+    confidence = measure_confidence(evidence)
+    if judge(evidence, confidence, refined.covariance, options) is not None:
         return None
     truth, pose = image.cam_from_world, refined.cam_from_world
     dtheta = Rotation.from_matrix(truth.R.T @ pose.R).as_rotvec()
@@ -129,9 +133,7 @@ def _try_image(
     return Trial(error, refined.covariance, mean_distance(query, latent, pose))
 
 
-def _surprise(
-    errors: NDArray[np.float64], covariances: NDArray[np.float64], std: NDArray[np.float64]
-) -> float:
+def _surprise(errors: Array, covariances: Array, std: Array) -> float:
     """Negative log-likelihood of errors (T, 3), Student's t, with more noise std (T,) an axis."""
     C = covariances + std[:, None, None] ** 2 * np.eye(3)
     squares = np.einsum("ti,tij,tj->t", errors, np.linalg.inv(C), errors)

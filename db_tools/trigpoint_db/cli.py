@@ -122,8 +122,9 @@ def describe_noise(noise: PoseNoise | None) -> str:
     if noise is None:
         return "too few of its images could be localized to tell how well its poses agree"
     return (
-        f"its poses agree to {noise.position * 100:.2g} % of their distance and "
-        f"{np.rad2deg(noise.rotation_rad):.2g} degrees"
+        f"its poses agree to {noise.position:.2g} and {noise.position_drift * 100:.2g} % of their "
+        f"distance, {np.rad2deg(noise.rotation_rad):.2g} degrees and "
+        f"{np.rad2deg(noise.rotation_drift_rad):.2g} for each unit of it"
     )
 
 

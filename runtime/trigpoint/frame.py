@@ -81,24 +81,30 @@ class ModelIdentity:
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """How well the poses of a map agree with each other.
+    """How well the poses of a map agree with each other: standard deviations along each axis.
 
     Parameters
     ----------
     position : float
-        Standard deviation of the vector between two cameras, along each axis, as a share of its
-        length.
+        Of the vector between two cameras that are close together, in the map's unit.
+    position_drift : float
+        What comes to it with their distance, as a share of that.
     rotation_rad : float
-        Standard deviation of the rotation between two cameras, about each axis.
+        Of the rotation between two cameras that are close together.
+    rotation_drift_rad : float
+        What comes to it, for each unit of distance.
     """
 
     position: float
+    position_drift: float
     rotation_rad: float
+    rotation_drift_rad: float
 
     def std(self, distances: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return standard deviations (K, 6) of (dc, dtheta) of cameras at these distances (K,)."""
-        position = np.repeat(self.position * distances[:, None], 3, axis=1)
-        return np.hstack([position, np.full_like(position, self.rotation_rad)])
+        position = np.hypot(self.position, self.position_drift * distances)
+        rotation = np.hypot(self.rotation_rad, self.rotation_drift_rad * distances)
+        return np.repeat(np.column_stack([position, rotation]), 3, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +150,7 @@ class Reason(StrEnum):
     )
     FEW_INLIERS = "FEW_INLIERS"  # too few latent points agree with the refined pose
     CLUSTERED_INLIERS = "CLUSTERED_INLIERS"  # those that agree lie in one place, or on one line
+    LOW_CONFIDENCE = "LOW_CONFIDENCE"  # what agrees with the pose may do so by accident
     AMBIGUOUS = "AMBIGUOUS"  # another pose explains as much: a repeated structure
     HIGH_UNCERTAINTY = "HIGH_UNCERTAINTY"  # a pose was found, but not a certain one
 
@@ -162,6 +169,8 @@ class Statistics:
     num_inliers: int = 0  # latent points that agree with the final pose
     num_rivals: int = 0  # that agree with another one instead
     spread_px: float = 0.0  # of the inliers: standard deviation where it is least
+    confidence: float = 0.0  # probability that the last pose, given or refused, is right
+    std_ratio: float = 0.0  # of the position, but for what is wrong with the map, by the depth
     depth: float = 0.0  # of the inliers, the median; in the map's unit
     turned_deg: int = 0  # counterclockwise, of the image that the features are of
     generator: str = ""  # which hypothesis was refined: "anchor_pairs" or "latent_points"

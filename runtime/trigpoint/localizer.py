@@ -36,7 +36,7 @@ from trigpoint.stages import (
     refine_with_anchors,
     solve_latent_points,
 )
-from trigpoint.verdict import gather_evidence, judge, position_std, see_share
+from trigpoint.verdict import gather_evidence, judge, measure_confidence, see_share
 
 MIN_CONTRAST = 2.0  # standard deviation of the gray levels
 GROWTH = 3  # each round has so many times the anchors of the one before
@@ -153,7 +153,7 @@ class Localizer:
                 anchors=trace.statistics.anchors + tuple(anchor.name for anchor in anchors),
             )
             solution = self._solve(query, not waiting, trace)
-            if not waiting or solution.std_ratio < options.enough_position_std_ratio:
+            if not waiting or solution.is_certain:
                 with trace.stage("doubles"):
                     batch = self._find_doubles(features, taken, retrieved, solution)
                 waiting = []
@@ -193,9 +193,10 @@ class Localizer:
         options = self.options
         with trace.stage("latent_points"):
             latent = find_latent_points(query, options)
-        trace.note(num_points=len(latent.point), num_candidates=len(latent.point))
-        if len(latent.point) < options.min_inliers:
-            detail = f"{len(latent.point)} points in two anchors"
+        num_candidates = len(latent.point)
+        trace.note(num_candidates=num_candidates)
+        if num_candidates < options.min_inliers:
+            detail = f"{num_candidates} points in two anchors"
             return _Solution(trace.lost(Reason.FEW_MATCHES, detail))
 
         hypotheses: list[tuple[int, str, Rigid3]] = []  # supporters, generator, cam_from_world
@@ -235,12 +236,15 @@ class Localizer:
             return _Solution(trace.lost(Reason.FEW_INLIERS, detail))
 
         with trace.stage("verdict"):
-            evidence = gather_evidence(query, latent, refined, options)
+            evidence = gather_evidence(query, num_candidates, latent, refined, options)
+            confidence = measure_confidence(evidence)
             trace.note(
                 num_inliers=evidence.num_inliers,
                 num_rivals=evidence.num_rivals,
                 spread_px=evidence.spread_px,
                 depth=evidence.depth,
+                confidence=confidence,
+                std_ratio=evidence.std_ratio,
             )
             covariance = calibrate_covariance(
                 refined.covariance,
@@ -248,12 +252,15 @@ class Localizer:
                 self.reader.pose_noise or UNMEASURED,
                 options,
             )
-            objection = judge(evidence, covariance, options)
+            objection = judge(evidence, confidence, covariance, options)
         if objection is not None:
             return _Solution(trace.lost(*objection))
-        std_ratio = position_std(refined.covariance) / evidence.depth
+        is_certain = (
+            confidence >= options.enough_confidence
+            and evidence.std_ratio < options.enough_position_std_ratio
+        )
         localized = Localized(refined.cam_from_world, covariance, trace.statistics)
-        return _Solution(localized, std_ratio, latent, MAX_DEPTHS * evidence.depth)
+        return _Solution(localized, is_certain, latent, MAX_DEPTHS * evidence.depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,9 +270,8 @@ class _Solution:
     Parameters
     ----------
     result : Localized or Lost
-    std_ratio : float
-        The position's standard deviation, but for what is wrong with the map, over the median
-        depth; inf where it is lost.
+    is_certain : bool
+        More anchors are not needed.
     seen : LatentPoints, optional
         What it was localized by.
     max_distance : float
@@ -273,7 +279,7 @@ class _Solution:
     """
 
     result: Result
-    std_ratio: float = math.inf
+    is_certain: bool = False
     seen: LatentPoints | None = None
     max_distance: float = math.inf
 

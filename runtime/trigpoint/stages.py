@@ -6,6 +6,7 @@ it and are multiplied by `Query.px`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -36,7 +37,8 @@ from trigpoint.rigid import Rigid3
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-UNMEASURED = PoseNoise(0.005, 0.001)  # of a map that does not say: better too large
+# Of a map that does not say: better too large.
+UNMEASURED = PoseNoise(0.0, 0.005, 0.001, 0.0)
 
 
 @dataclass(frozen=True)
@@ -69,8 +71,9 @@ class LocalizerOptions:
     anchor_rotation_noise_deg: float = 0.02
     covariance_scale: float = 4.0  # errors have longer tails than a normal distribution
     min_features: int = 50
-    min_inliers: int = 30
-    min_inlier_ratio: float = 0.5
+    min_inliers: int = 12
+    min_confidence: float = 0.95
+    enough_confidence: float = 0.99
     max_rival_ratio: float = 0.3  # of the inliers: points that agree on another pose
     min_spread_px: float = 10.0  # of the inliers, standard deviation
     max_depth_std_ratio: float = 0.2  # of the inliers' distances, the median
@@ -90,8 +93,9 @@ class LocalizerOptions:
                 raise ConfigError(f"{name} must be positive and below a million, not {value}")
         if not 0 <= self.anchor_diversity <= 1:
             raise ConfigError(f"anchor_diversity must be 0 to 1, not {self.anchor_diversity}")
-        if self.min_inlier_ratio > 1:
-            raise ConfigError(f"min_inlier_ratio must be at most 1, not {self.min_inlier_ratio}")
+        for name in ("min_confidence", "enough_confidence"):
+            if getattr(self, name) > 1:
+                raise ConfigError(f"{name} must be at most 1, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,7 +355,10 @@ def refine_with_anchors(
         px=query.px,
         sigma_px=options.keypoint_sigma_px,
         pose_noise=PoseNoise(
-            options.anchor_position_noise, float(np.deg2rad(options.anchor_rotation_noise_deg))
+            position=0.0,
+            position_drift=options.anchor_position_noise,
+            rotation_rad=math.radians(options.anchor_rotation_noise_deg),
+            rotation_drift_rad=0.0,
         ),
         max_error_px=options.max_reprojection_error_px,
     )

@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 # Poses nearer to each other than this are one pose, found twice.
 SAME_PLACE = 0.1  # of the median depth
 SAME_DIRECTION_DEG = 5.0
+# Learnt by benchmarks/localizer/confidence.py.
+CONFIDENCE = (-3.18, 2.10, -1.73)
 
 
 @dataclass(frozen=True)
@@ -35,8 +37,10 @@ class Evidence:
 
     Parameters
     ----------
+    num_candidates : int
+        Latent points of all matches, before any pose.
     num_points : int
-        Latent points.
+        Latent points of the matches that agree with the hypothesis.
     num_inliers : int
         Those that agree with the pose.
     num_rivals : int
@@ -49,18 +53,27 @@ class Evidence:
     depth_std_ratio : float
         The median standard deviation of their distances, as the anchors determine them, over the
         distance.
+    std_ratio : float
+        The position's standard deviation, but for what is wrong with the whole map, over the median
+        depth.
     """
 
+    num_candidates: int
     num_points: int
     num_inliers: int
     num_rivals: int
     spread_px: float
     depth: float
     depth_std_ratio: float
+    std_ratio: float
 
 
 def gather_evidence(
-    query: Query, latent: LatentPoints, refined: RefinedPose, options: LocalizerOptions
+    query: Query,
+    num_candidates: int,
+    latent: LatentPoints,
+    refined: RefinedPose,
+    options: LocalizerOptions,
 ) -> Evidence:
     """Measure what a verdict is made of."""
     points = query.points[latent.point[refined.inliers]]
@@ -72,12 +85,14 @@ def gather_evidence(
     depth_std = options.keypoint_sigma_px * np.sqrt(squares) / (sight**2).sum(axis=1)
     num_inliers = len(points)
     return Evidence(
+        num_candidates,
         len(latent.point),
         num_inliers,
         count_rivals(query, refined.cam_from_world, depth, num_inliers, options),
         math.sqrt(max(least, 0.0)) / query.px,
         depth,
         float(np.median(depth_std)),
+        position_std(refined.covariance) / depth,
     )
 
 
@@ -123,18 +138,32 @@ def see_share(
     return float((inside & (np.linalg.norm(points, axis=1) < max_distance)).mean())
 
 
+def measure_confidence(evidence: Evidence) -> float:
+    """Return the probability that a pose is right, 0 to 1.
+
+    Logistic regression on the share of the latent points that agree with the pose, and on how well
+    they determine its position. Nothing else that was tried made it better (ADR 12).
+    """
+    agreeing = math.log(evidence.num_inliers / evidence.num_candidates)
+    z = CONFIDENCE[0] + CONFIDENCE[1] * agreeing + CONFIDENCE[2] * math.log(evidence.std_ratio)
+    return 1 / (1 + math.exp(-z))
+
+
 def judge(
-    evidence: Evidence, covariance: Array, options: LocalizerOptions
+    evidence: Evidence, confidence: float, covariance: Array, options: LocalizerOptions
 ) -> tuple[Reason, str] | None:
     """Say why a pose with this covariance must not be used, or None."""
-    num_inliers, num_points = evidence.num_inliers, evidence.num_points
-    if num_inliers < max(options.min_inliers, options.min_inlier_ratio * num_points):
-        return Reason.FEW_INLIERS, f"{num_inliers} of {num_points} latent points agree"
+    num_inliers = evidence.num_inliers
+    if num_inliers < options.min_inliers:
+        return Reason.FEW_INLIERS, f"{num_inliers} latent points agree"
     if evidence.num_rivals > options.max_rival_ratio * num_inliers:
         return (
             Reason.AMBIGUOUS,
             f"{num_inliers} latent points agree, and {evidence.num_rivals} on another pose",
         )
+    if confidence < options.min_confidence:
+        found = f"{num_inliers} of {evidence.num_candidates} latent points agree"
+        return Reason.LOW_CONFIDENCE, f"{confidence:.2f}: {found}"
     if evidence.spread_px < options.min_spread_px:
         return Reason.CLUSTERED_INLIERS, f"within {evidence.spread_px:.0f} px of a line"
     if evidence.depth_std_ratio > options.max_depth_std_ratio:

@@ -14,8 +14,8 @@ from trigpoint.rigid import Rigid3
 
 PX = 1 / 500
 SIGMA_PX = 0.5
-NOISE = PoseNoise(0.01, 0.002)
-EXACT = PoseNoise(0.0, 0.0)
+NOISE = PoseNoise(0.0, 0.01, 0.002, 0.0)
+EXACT = PoseNoise(0.0, 0.0, 0.0, 0.0)
 
 
 def near(pose: Rigid3) -> Rigid3:

@@ -134,7 +134,12 @@ def test_a_frame_with_three_spots_has_too_few_features(
 def test_noise_is_not_a_place(model: FeatureModel, reader: MapReader) -> None:
     noise = generator("noise").integers(0, 255, (480, 640)).astype(np.uint8)
     result = Localizer(model, reader).localize(Frame(noise, CAMERA))
-    assert reason(result) in (Reason.FEW_MATCHES, Reason.FEW_INLIERS, Reason.FEW_ANCHORS)
+    assert reason(result) in (
+        Reason.FEW_MATCHES,
+        Reason.FEW_INLIERS,
+        Reason.FEW_ANCHORS,
+        Reason.LOW_CONFIDENCE,
+    )
 
 
 def test_an_empty_map_is_no_map(
@@ -184,7 +189,7 @@ def test_a_frame_of_another_size_than_its_camera_is_an_error() -> None:
     [
         {"num_anchors": 1},
         {"min_inliers": 0},
-        {"min_inlier_ratio": 40},
+        {"min_confidence": 40},
         {"anchor_diversity": -1},
         {"first_anchors": 1},
     ],

@@ -18,14 +18,21 @@ from trigpoint.stages import (
     refine_with_anchors,
     solve_latent_points,
 )
-from trigpoint.verdict import Evidence, gather_evidence, judge, position_std
+from trigpoint.verdict import Evidence, gather_evidence, judge, measure_confidence, position_std
 
 Array = NDArray[np.float64]
 
 PX = 1 / 500
 OPTIONS = LocalizerOptions()
 GOOD = Evidence(
-    num_points=200, num_inliers=180, num_rivals=0, spread_px=80.0, depth=5.0, depth_std_ratio=0.01
+    num_candidates=250,
+    num_points=200,
+    num_inliers=180,
+    num_rivals=0,
+    spread_px=80.0,
+    depth=5.0,
+    depth_std_ratio=0.01,
+    std_ratio=0.001,
 )
 CERTAIN = 1e-6 * np.eye(6)
 
@@ -55,17 +62,18 @@ def make_query(
 def solve(query: Query, options: LocalizerOptions = OPTIONS) -> tuple[Evidence, Array]:
     """Do as the localizer does; the covariance is of the images alone."""
     latent = find_latent_points(query, options)
+    num_candidates = len(latent.point)
     hypothesis = solve_latent_points(query, latent, options)
     assert hypothesis is not None
     latent, refined = refine(query, hypothesis, options)
     assert refined is not None
     refined = refine_with_anchors(query, latent, refined.cam_from_world, options)
     assert refined is not None
-    return gather_evidence(query, latent, refined, options), refined.covariance
+    return gather_evidence(query, num_candidates, latent, refined, options), refined.covariance
 
 
 def objection(evidence: Evidence, covariance: Array = CERTAIN) -> Reason | None:
-    found = judge(evidence, covariance, OPTIONS)
+    found = judge(evidence, measure_confidence(evidence), covariance, OPTIONS)
     return found[0] if found else None
 
 
@@ -127,7 +135,7 @@ def test_anchors_at_one_place_give_no_certain_pose() -> None:
         return
     refined = refine_with_anchors(query, latent, refined.cam_from_world, OPTIONS)
     if refined is not None:
-        evidence = gather_evidence(query, latent, refined, OPTIONS)
+        evidence = gather_evidence(query, 200, latent, refined, OPTIONS)
         assert objection(evidence, refined.covariance) is not None
 
 
@@ -150,12 +158,21 @@ def test_anchors_on_one_line_with_the_query_determine_it_by_the_points_off_the_l
     assert error < 4 * position_std(refined.covariance) < 0.1
 
 
+def test_confidence_rises_with_the_share_that_agrees_and_falls_with_uncertainty() -> None:
+    assert 0.99 < measure_confidence(GOOD) < 1
+    fewer = replace(GOOD, num_inliers=60)
+    vaguer = replace(GOOD, std_ratio=0.02)
+    assert measure_confidence(replace(fewer, std_ratio=0.02)) < 0.9
+    assert measure_confidence(fewer) < measure_confidence(GOOD)
+    assert measure_confidence(vaguer) < measure_confidence(GOOD)
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
         ({}, None),
-        ({"num_inliers": 29, "num_points": 30}, Reason.FEW_INLIERS),
-        ({"num_inliers": 99}, Reason.FEW_INLIERS),
+        ({"num_inliers": 11, "num_points": 12, "num_candidates": 12}, Reason.FEW_INLIERS),
+        ({"num_inliers": 40, "std_ratio": 0.01}, Reason.LOW_CONFIDENCE),
         ({"num_rivals": 55}, Reason.AMBIGUOUS),
         ({"num_rivals": 54}, None),
         ({"spread_px": 9.9}, Reason.CLUSTERED_INLIERS),
