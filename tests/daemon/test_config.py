@@ -75,7 +75,7 @@ path = "/var/log/trigpoint.mcap"
         (MINIMAL + "rate = nan", "'source.rate'"),
         (MINIMAL + "[localizer]\nnum_anchors = '20'", "'localizer.num_anchors': .*valid integer"),
         (MINIMAL + "[log]\npath = 'a'\nframes = 0", "'log.frames': .*valid boolean"),
-        (MINIMAL + "[localizer]\nmin_inlier_ratio = 40", "min_inlier_ratio must be at most 1"),
+        (MINIMAL + "[localizer]\nmin_confidence = 40", "min_confidence must be at most 1"),
         (MINIMAL + "[model]\nnetwork = 3", "'model.network': .* 'tiny', 'base', 'large' or"),
         (MINIMAL + "[model]\npath = 'a'", "unknown key 'model.path'"),
         ("map = ", "is not TOML"),

@@ -87,12 +87,13 @@ def test_a_map_of_another_model_put_in_place_is_not_taken_up(
 
 
 def test_a_damaged_image_of_the_map_costs_the_frames_that_need_it_alone(
-    demo: Demo, map_path: Path, model: FeatureModel, captured: Captured
+    demo: Demo, survey: list[PosedImage], tmp_path: Path, model: FeatureModel, captured: Captured
 ) -> None:
-    data = bytearray(map_path.read_bytes())
-    middle = len(data) - 20_000  # within the descriptors of the only image
+    build_map(tmp_path / "two.tpmap", survey[:2], demo.folder / "survey", model)
+    data = bytearray((tmp_path / "two.tpmap").read_bytes())
+    middle = len(data) - 20_000  # within the descriptors of one of the two images
     data[middle : middle + 64] = bytes(64)
-    damaged = map_path.with_name("damaged.tpmap")
+    damaged = tmp_path / "damaged.tpmap"
     damaged.write_bytes(data)
     with MapReader.open(damaged, model.identity) as reader:
         pipeline = Pipeline(Localizer(model, reader), reader, Rigid3.identity(), "map")
