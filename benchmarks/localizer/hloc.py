@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -105,6 +106,7 @@ def write_matches(path: Path, matches: Matches) -> None:
 
 
 def _import(checkout: Path) -> tuple[Any, Any, Any]:
+    os.environ["TQDM_DISABLE"] = "1"  # before hloc imports it
     sys.path.insert(0, str(checkout))
     try:
         triangulation = importlib.import_module("hloc.triangulation")

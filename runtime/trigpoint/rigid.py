@@ -124,9 +124,11 @@ def quaternion_from_rotation(R: Array) -> Array:
 def skew(v: Array) -> Array:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3): skew(v) u = v x u."""
     x, y, z = np.moveaxis(v, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    matrices = np.zeros((*v.shape, 3))
+    matrices[..., 0, 1], matrices[..., 0, 2] = -z, y
+    matrices[..., 1, 0], matrices[..., 1, 2] = z, -x
+    matrices[..., 2, 0], matrices[..., 2, 1] = -y, x
+    return matrices
 
 
 def rotation_from_vector(rotvec: Array) -> Array:

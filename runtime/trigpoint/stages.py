@@ -53,7 +53,7 @@ class LocalizerOptions:
     max_keypoints: int = 1024
     # "best": latent points first; anchor pairs too where these have few supporters
     generator: Literal["best", "anchor_pairs", "latent_points"] = "best"
-    min_support: int = 100  # latent points that make a second hypothesis needless
+    min_support: int = 12  # latent points that make a second hypothesis needless
     center: Literal["robust", "least_squares"] = "robust"  # the latter is Proposition 1 as it is
     num_relative_poses: int = 8
     min_relative_inliers: int = 15
@@ -287,8 +287,7 @@ def solve_latent_points(
 ) -> Rigid3 | None:
     """Latent points first: the query's pose by P3P in LO-RANSAC, with no relative pose at all."""
     # The more anchors agree on a point, the likelier it is right: sampled first.
-    _, starts = latent.tracks.groups()
-    order = np.argsort(-np.diff(starts, append=len(latent.tracks)), kind="stable")
+    order = np.argsort(-latent.tracks.lengths, kind="stable")
     return estimate_absolute_pose(
         latent.points3d[order],
         query.points[latent.point[order]],

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from trigpoint.camera import Camera
 from trigpoint.frame import Reason
 from trigpoint.geometry.pose_refinement import RefinedPose
-from trigpoint.geometry.triangulation import LatentPoints
+from trigpoint.geometry.triangulation import LatentPoints, keep_agreeing
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint.stages import (
     LocalizerOptions,
@@ -109,10 +109,11 @@ def count_rivals(
     wrong copy agree among themselves as well as those of the right one.
     """
     explained = follows_epipolar_lines(query, cam_from_world, options.max_guided_error_px)
-    other = replace(query, tracks=query.tracks[~explained].of_length(2))
-    enough = options.max_rival_ratio * num_inliers
-    if len(other.tracks.groups()[0]) < enough:
+    limit, enough = options.max_ray_error_px, options.max_rival_ratio * num_inliers
+    rest = keep_agreeing(query.views, query.tracks[~explained], max_error_px=limit)
+    if len(rest.lengths) < enough:
         return 0
+    other = replace(query, tracks=rest)
     latent = find_latent_points(other, options)
     if len(latent.point) < enough:
         return 0

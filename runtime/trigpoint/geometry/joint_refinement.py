@@ -198,7 +198,7 @@ class _Problem:
         tracks = self.latent.tracks
         num_views, num_points = len(self.view_std), len(self.points2d)
         _, starts = tracks.groups()
-        index = np.repeat(np.arange(num_points), np.diff(starts, append=len(tracks)))
+        index = np.repeat(np.arange(num_points), tracks.lengths)
         error: Array = state.errors * self.view_std
         views = perturb(self.views_from_world, error)[tracks.view]
         r, A, B, in_front = reprojection(views, state.points3d[index], tracks.xy)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trigpoint.rigid import Rigid3, rotate, rotation_from_vector, skew
+from trigpoint.rigid import Rigid3, rotate, rotation_from_vector
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,13 @@ def reprojection(
     z = np.where(in_front, Y[:, 2], 1.0)
     xy = Y[:, :2] / z[:, None]
     by_point = (R[..., :2, :] - xy[:, :, None] * R[..., 2:, :]) / z[:, None, None]
-    by_pose = np.concatenate([-by_point, by_point @ skew(from_center)], axis=2)
+    by_pose = np.empty((len(Y), 2, 6))
+    by_pose[:, :, :3] = -by_point
+    # by_point @ skew(from_center): the cross product of its rows with that vector.
+    a, c = by_point, from_center[:, None]
+    by_pose[:, :, 3] = a[:, :, 1] * c[:, :, 2] - a[:, :, 2] * c[:, :, 1]
+    by_pose[:, :, 4] = a[:, :, 2] * c[:, :, 0] - a[:, :, 0] * c[:, :, 2]
+    by_pose[:, :, 5] = a[:, :, 0] * c[:, :, 1] - a[:, :, 1] * c[:, :, 0]
     return xy - points2d, by_pose, by_point, in_front
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +45,18 @@ class Tracks:
 
     def groups(self) -> tuple[Index, Index]:
         """Return the points that occur (M,) and where each one's observations start (M,)."""
-        starts = np.flatnonzero(np.diff(self.point, prepend=-1))
-        return self.point[starts], starts
+        return self.point[self._starts], self._starts
+
+    @cached_property
+    def _starts(self) -> Index:
+        is_first = np.ones(len(self), bool)
+        np.not_equal(self.point[1:], self.point[:-1], out=is_first[1:])
+        return np.flatnonzero(is_first)
+
+    @cached_property
+    def lengths(self) -> Index:
+        """How many observations each point has (M,)."""
+        return np.diff(self._starts, append=len(self))
 
     @classmethod
     def concatenate(cls, parts: Sequence[Tracks]) -> Tracks:
@@ -63,14 +74,14 @@ class Tracks:
 
     def of_length(self, min_length: int) -> Tracks:
         """Keep the points with at least so many observations."""
-        return self[self.in_groups_of(min_length, np.ones(len(self), bool))]
+        return self[np.repeat(self.lengths >= min_length, self.lengths)]
 
     def in_groups_of(self, min_length: int, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Of the observations kept (P,), say which are of points that keep at least so many."""
-        _, starts = self.groups()
-        lengths = np.diff(starts, append=len(self))
-        num_kept = np.add.reduceat(kept.astype(np.intp), starts) if len(self) else lengths
-        return kept & np.repeat(num_kept >= min_length, lengths)
+        num_kept = (
+            np.add.reduceat(kept.astype(np.intp), self._starts) if len(self) else self.lengths
+        )
+        return kept & np.repeat(num_kept >= min_length, self.lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +112,7 @@ def intersect_rays(views_from_world: Rigid3, tracks: Tracks) -> Array:
     For each point the solution of sum (I - d d^T) X = sum (I - d d^T) c, as in Proposition 1, with
     weights 1 / px^2. Rays that are nearly parallel give a point far away, not an error.
     """
-    return _solve_rays(_ray_equations(views_from_world, tracks), tracks.groups()[1])
+    return _solve_rays(_ray_equations(views_from_world, tracks), tracks)
 
 
 def _ray_equations(views_from_world: Rigid3, tracks: Tracks) -> Array:
@@ -114,10 +125,10 @@ def _ray_equations(views_from_world: Rigid3, tracks: Tracks) -> Array:
     return np.concatenate([normal, rotate(normal, c)[:, :, None], c[:, :, None]], axis=2)
 
 
-def _solve_rays(equations: Array, starts: Index) -> Array:
-    total = np.add.reduceat(equations, starts)
+def _solve_rays(equations: Array, tracks: Tracks) -> Array:
+    total = np.add.reduceat(equations, tracks.groups()[1])
     A, b = total[:, :, :3], total[:, :, 3:4]
-    mean = total[:, :, 4:] / np.diff(starts, append=len(equations))[:, None, None]
+    mean = total[:, :, 4:] / tracks.lengths[:, None, None]
     # Parallel rays leave A singular along themselves: a tiny pull to the mean center settles it.
     pull = 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None]
     solution: Array = np.linalg.solve(A + pull * np.eye(3), b + pull * mean)[:, :, 0]
@@ -146,8 +157,7 @@ def project_tracks(
         Of the projection by the point, in px.
     in_front : (P,) bool
     """
-    _, starts = tracks.groups()
-    X = np.repeat(points3d, np.diff(starts, append=len(tracks)), axis=0)
+    X = np.repeat(points3d, tracks.lengths, axis=0)
     R = views_from_world.R[tracks.view]
     Y = rotate(R, X) + views_from_world.t[tracks.view]
     in_front = Y[:, 2] > 0
@@ -228,8 +238,7 @@ def keep_agreeing(views_from_world: Rigid3, tracks: Tracks, *, max_error_px: flo
     tracks = tracks.of_length(2)
     if len(tracks) == 0:
         return tracks
-    num, (_, starts) = len(tracks), tracks.groups()
-    lengths = np.diff(starts, append=num)
+    num, (_, starts), lengths = len(tracks), tracks.groups(), tracks.lengths
     # Each observation with those of its point that come after it.
     index = np.arange(num)
     following = np.repeat(starts + lengths, lengths) - index - 1
@@ -269,8 +278,8 @@ def triangulate_robust(
     settled = [active[:0]]
     while len(active):
         _, starts = active.groups()
-        lengths = np.diff(starts, append=len(active))
-        X = _solve_rays(equations, starts)
+        lengths = active.lengths
+        X = _solve_rays(equations, active)
         Y = views_from_world[active.view].apply(np.repeat(X, lengths, axis=0))
         in_front = Y[:, 2] > 0
         z = np.where(in_front, Y[:, 2], 1.0)
