@@ -29,7 +29,7 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.output import check_output, open_text
 from trigpoint.stages import LocalizerOptions
 
-TABLES = ("accuracy", "averaging", "trials")
+TABLES = ("accuracy", "anchors", "averaging", "trials")
 DEFAULT = "as many as needed"
 SWEEP = (5, 10, 20, 50, 100)
 
@@ -40,9 +40,8 @@ def at_once(num_anchors: int) -> LocalizerOptions:
 
 
 REFERENCE = "20 anchors"
-METHODS = {REFERENCE: at_once(20), DEFAULT: LocalizerOptions()}
-MORE_METHODS = {f"{k} anchors": at_once(k) for k in SWEEP if k != 20}
-TIMED = (DEFAULT, REFERENCE, "50 anchors")
+METHODS = {REFERENCE: at_once(20), DEFAULT: LocalizerOptions(), "50 anchors": at_once(50)}
+MORE_METHODS = {f"{k} anchors": at_once(k) for k in SWEEP}
 
 
 def compare_sets(
@@ -65,12 +64,13 @@ def measure(arguments: argparse.Namespace) -> str:
     """Measure what was asked for: Markdown."""
     folders = find_sets(arguments.data, arguments.sets)
     parts = [f"# The localizer\n\n{describe_machine()}"]
-    if "accuracy" in arguments.only:
-        cases = compare_sets(folders, FeatureModel.load(), METHODS | MORE_METHODS, arguments.hloc)
+    if {"accuracy", "anchors"} & set(arguments.only):
+        methods = METHODS | (MORE_METHODS if "anchors" in arguments.only else {})
+        cases = compare_sets(folders, FeatureModel.load(), methods, arguments.hloc)
         if arguments.hloc:
             parts.append(f"## Accuracy, `base`\n\n{tables.compare_accuracy(cases, DEFAULT)}")
-        parts.append(f"## Time, `base`\n\n{tables.compare_times(cases, TIMED)}")
-        sweep = [*sorted(METHODS | MORE_METHODS, key=lambda m: (m == DEFAULT, len(m), m))]
+        parts.append(f"## Time, `base`\n\n{tables.compare_times(cases, list(METHODS))}")
+        sweep = sorted(methods, key=lambda name: (name == DEFAULT, len(name), name))
         parts.append(f"## Anchors\n\n{tables.compare_anchors(cases, sweep, REFERENCE)}")
         parts.append(f"## Covariance\n\n{tables.check_coverage(cases, DEFAULT)}")
         if arguments.picture:

@@ -130,8 +130,8 @@ class Localizer:
     ) -> Result:
         """Take anchors, best first, until the pose is certain, or they or the time run out.
 
-        A pose that is certain is tried once more with the images of other places that look as much
-        like the frame, if there are any.
+        What is found is tried again with the images of other places that look as much like the
+        frame, while there are any.
         """
         options, query = self.options, None
         waiting, taken = list(retrieved), list[int]()

@@ -82,7 +82,7 @@ def gather_evidence(
     depth = float(np.median(depths))
     sight = latent.points3d[refined.inliers] - refined.cam_from_world.center
     squares = np.einsum("mi,mij,mj->m", sight, latent.covariance[refined.inliers], sight)
-    depth_std = options.keypoint_sigma_px * np.sqrt(squares) / (sight**2).sum(axis=1)
+    depth_std = options.keypoint_sigma_px * np.sqrt(np.maximum(squares, 0)) / (sight**2).sum(axis=1)
     num_inliers = len(points)
     return Evidence(
         num_candidates,
