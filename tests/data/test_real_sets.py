@@ -39,7 +39,7 @@ def trigpoint_db(*arguments: object, code: int = 0) -> str:
         ("fox", "", 10, 0.005, 0.06),
         ("fox", "_block", 15, 0.005, 0.06),
         ("tnt_truck", "", 25, 0.004, 0.06),
-        ("tnt_truck", "_block", 34, 0.010, 0.2),
+        ("tnt_truck", "_block", 31, 0.010, 0.2),
         ("kitti_seq1", "", 20, 0.012, 0.10),
         ("kitti_seq1", "_block", 32, 0.020, 0.12),
         ("strecha_fountain_p11", "", 2, 0.005, 0.03),
