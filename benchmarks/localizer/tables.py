@@ -117,7 +117,7 @@ def check_coverage(cases: Cases, method: str) -> str:
     rows = []
     for name, own in [*squares.items(), ("all", np.concatenate(list(squares.values())))]:
         row = [name, f"{len(own)}", *(f"{coverage(own[:, i], 0.95):.0%}" for i in (0, 1))]
-        if name != "all":
+        if name != "all" and len(squares) > 1:
             others = np.concatenate([s for other, s in squares.items() if other != name])
             for i in (0, 1):
                 scale = np.quantile(others[:, i], 0.95) / limit
