@@ -142,7 +142,7 @@ def report(folders: Sequence[Path]) -> str:
             by_number.append([f"{wrong_share:.0%}", f"{num}", *(f"{100 * m:.2f}" for m in medians)])
     return "\n\n".join(
         [
-            markdown(["world's origin", "noise (deg)", *AVERAGES], by_noise, num_words=1),
+            markdown(["world's origin", "noise (deg)", *AVERAGES], by_noise),
             markdown(["wrong", "anchors", *AVERAGES], by_number),
         ]
     )

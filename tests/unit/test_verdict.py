@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from tests.unit.scenes import generator, make_scene, project
 from trigpoint.frame import Reason
+from trigpoint.geometry.pose_refinement import RefinedPose
 from trigpoint.geometry.triangulation import Tracks
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import (
@@ -59,17 +60,17 @@ def make_query(
     )
 
 
-def solve(query: Query, options: LocalizerOptions = OPTIONS) -> tuple[Evidence, Array]:
+def solve(query: Query) -> tuple[Evidence, RefinedPose]:
     """Do as the localizer does; the covariance is of the images alone."""
-    latent = find_latent_points(query, options)
+    latent = find_latent_points(query, OPTIONS)
     num_candidates = len(latent.point)
-    hypothesis = solve_latent_points(query, latent, options)
+    hypothesis = solve_latent_points(query, latent, OPTIONS)
     assert hypothesis is not None
-    latent, refined = refine(query, hypothesis, options)
+    latent, refined = refine(query, hypothesis, OPTIONS)
     assert refined is not None
-    refined = refine_with_anchors(query, latent, refined.cam_from_world, options)
+    refined = refine_with_anchors(query, latent, refined.cam_from_world, OPTIONS)
     assert refined is not None
-    return gather_evidence(query, num_candidates, latent, refined, options), refined.covariance
+    return gather_evidence(query, num_candidates, latent, refined, OPTIONS), refined
 
 
 def objection(evidence: Evidence, covariance: Array = CERTAIN) -> Reason | None:
@@ -90,12 +91,12 @@ def in_two_places(key: str) -> tuple[Query, Query]:
 
 def test_a_scene_at_two_places_is_ambiguous() -> None:
     once, twice = in_two_places("two places")
-    evidence, covariance = solve(once)
+    evidence, refined = solve(once)
     assert evidence.num_rivals == 0
-    assert objection(evidence, covariance) is None
-    evidence, covariance = solve(twice)
+    assert objection(evidence, refined.covariance) is None
+    evidence, refined = solve(twice)
     assert evidence.num_rivals > 0.8 * evidence.num_inliers
-    assert objection(evidence, covariance) is Reason.AMBIGUOUS
+    assert objection(evidence, refined.covariance) is Reason.AMBIGUOUS
 
 
 def test_something_that_has_moved_is_no_rival_while_it_is_small() -> None:
@@ -105,9 +106,9 @@ def test_something_that_has_moved_is_no_rival_while_it_is_small() -> None:
     moved[:60] += [0.8, 0.3, 0.5]
     points2d = project(scene.views_from_world[:1], moved)[0]
     query = make_query(points2d, scene.views_from_world[1:], scene.points2d[1:], "cart")
-    evidence, covariance = solve(query)
+    evidence, refined = solve(query)
     assert evidence.num_inliers > 200
-    assert objection(evidence, covariance) is None
+    assert objection(evidence, refined.covariance) is None
 
 
 def test_points_in_one_corner_are_clustered() -> None:
@@ -146,14 +147,7 @@ def test_anchors_on_one_line_with_the_query_determine_it_by_the_points_off_the_l
     centers = np.column_stack([np.zeros((7, 2)), along - 5.0])
     views = Rigid3.from_center(np.tile(np.eye(3), (7, 1, 1)), centers)
     seen = project(views, scene.points3d)
-    query = make_query(seen[0], views[1:], seen[1:], "line")
-    latent = find_latent_points(query, OPTIONS)
-    hypothesis = solve_latent_points(query, latent, OPTIONS)
-    assert hypothesis is not None
-    latent, refined = refine(query, hypothesis, OPTIONS)
-    assert refined is not None
-    refined = refine_with_anchors(query, latent, refined.cam_from_world, OPTIONS)
-    assert refined is not None
+    _, refined = solve(make_query(seen[0], views[1:], seen[1:], "line"))
     error = np.linalg.norm(refined.cam_from_world.center - views.center[0])
     assert error < 4 * position_std(refined.covariance) < 0.1
 
