@@ -28,7 +28,6 @@ from trigpoint.stages import (
     match_anchors,
     mean_distance,
     refine,
-    refine_with_anchors,
     solve_latent_points,
 )
 from trigpoint.verdict import gather_evidence, judge, measure_confidence
@@ -119,8 +118,6 @@ def _try_image(
     if start is None:
         return None
     latent, refined = refine(query, start, options)
-    if refined is not None:
-        refined = refine_with_anchors(query, latent, refined.cam_from_world, options)
     if refined is None:
         return None
     evidence = gather_evidence(query, num_candidates, latent, refined, options)

@@ -33,7 +33,6 @@ from trigpoint.stages import (
     match_anchors,
     mean_distance,
     refine,
-    refine_with_anchors,
     solve_latent_points,
 )
 from trigpoint.verdict import gather_evidence, judge, measure_confidence, see_share
@@ -228,8 +227,6 @@ class Localizer:
         with trace.stage("refinement"):
             _, generator, hypothesis = max(hypotheses, key=lambda hypothesis: hypothesis[0])
             latent, refined = refine(query, hypothesis, options)
-            if refined is not None:
-                refined = refine_with_anchors(query, latent, refined.cam_from_world, options)
         trace.note(generator=generator, num_points=len(latent.point))
         if refined is None:
             detail = "the latent points do not determine a pose"

@@ -25,8 +25,9 @@ from trigpoint.geometry.center_averaging import (
     center_directions,
 )
 from trigpoint.geometry.epipolar import essential_matrix, sampson_error
-from trigpoint.geometry.joint_refinement import refine_jointly
-from trigpoint.geometry.pose_refinement import RefinedPose, refine_pose, reprojection
+from trigpoint.geometry.joint_refinement import RefinedPose, refine_jointly
+from trigpoint.geometry.points_last import project
+from trigpoint.geometry.pose_refinement import refine_pose
 from trigpoint.geometry.relative_pose import estimate_relative_pose
 from trigpoint.geometry.rotation_averaging import average_rotations
 from trigpoint.geometry.triangulation import LatentPoints, Tracks, keep_agreeing, triangulate_robust
@@ -299,11 +300,9 @@ def count_support(
     query: Query, latent: LatentPoints, cam_from_world: Rigid3, options: LocalizerOptions
 ) -> int:
     """Count latent points that a hypothesis projects onto their keypoints."""
-    residuals, _, _, in_front = reprojection(
-        cam_from_world, latent.points3d, query.points[latent.point]
-    )
-    near = np.linalg.norm(residuals, axis=1) < options.max_hypothesis_error_px * query.px
-    return int((near & in_front).sum())
+    seen = project(cam_from_world, latent.points3d)
+    distances = np.linalg.norm(seen.xy - query.points[latent.point].T, axis=0)
+    return int((seen.in_front & (distances < options.max_hypothesis_error_px * query.px)).sum())
 
 
 def follows_epipolar_lines(
@@ -320,7 +319,7 @@ def follows_epipolar_lines(
 def refine(
     query: Query, cam_from_world: Rigid3, options: LocalizerOptions
 ) -> tuple[LatentPoints, RefinedPose | None]:
-    """Stage 2 of the paper: guided matches, latent points (E1), pose (E2)."""
+    """Stage 2 of the paper: guided matches, latent points (E1), pose (E2); then all together."""
     guided = follows_epipolar_lines(query, cam_from_world, options.max_guided_error_px)
     tracks = query.tracks[guided]
     num_matches = np.bincount(tracks.view, minlength=len(query.views))
@@ -329,28 +328,22 @@ def refine(
     latent = triangulate_robust(query.views, tracks, max_error_px=options.max_ray_error_px)
     if len(latent.point) == 0:
         return latent, None
-    refined = refine_pose(
+    points2d = query.points[latent.point]
+    sharper = refine_pose(
         cam_from_world,
         latent.points3d,
-        query.points[latent.point],
-        # For image noise of 1 instead of one pixel.
-        point_covariance=latent.covariance / query.px**2,
+        points2d,
         sigma=options.keypoint_sigma_px * query.px,
         max_error=options.max_reprojection_error_px * query.px,
     )
-    return latent, refined
-
-
-def refine_with_anchors(
-    query: Query, latent: LatentPoints, cam_from_world: Rigid3, options: LocalizerOptions
-) -> RefinedPose | None:
-    """Refine once more, with the anchors' poses free to move a little."""
-    chosen, view = np.unique(latent.tracks.view, return_inverse=True)
-    return refine_jointly(
-        cam_from_world,
-        query.views[chosen],
+    if sharper is None:
+        return latent, None
+    seeing, view = np.unique(latent.tracks.view, return_inverse=True)
+    refined = refine_jointly(
+        sharper,
+        query.views[seeing],
         replace(latent, tracks=replace(latent.tracks, view=view)),
-        query.points[latent.point],
+        points2d,
         px=query.px,
         sigma_px=options.keypoint_sigma_px,
         pose_noise=PoseNoise(
@@ -361,6 +354,7 @@ def refine_with_anchors(
         ),
         max_error_px=options.max_reprojection_error_px,
     )
+    return latent, refined
 
 
 def mean_distance(query: Query, latent: LatentPoints, cam_from_world: Rigid3) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
 from trigpoint.frame import Reason
-from trigpoint.geometry.pose_refinement import RefinedPose
+from trigpoint.geometry.joint_refinement import RefinedPose
 from trigpoint.geometry.triangulation import LatentPoints, keep_agreeing
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint.stages import (
@@ -81,8 +81,8 @@ def gather_evidence(
     depths = refined.cam_from_world.apply(latent.points3d[refined.inliers])[:, 2]
     depth = float(np.median(depths))
     sight = latent.points3d[refined.inliers] - refined.cam_from_world.center
-    squares = np.einsum("mi,mij,mj->m", sight, latent.covariance[refined.inliers], sight)
-    depth_std = options.keypoint_sigma_px * np.sqrt(np.maximum(squares, 0)) / (sight**2).sum(axis=1)
+    squares = np.einsum("mi,mij,mj->m", sight, refined.point_covariance[refined.inliers], sight)
+    depth_std = np.sqrt(np.maximum(squares, 0)) / (sight**2).sum(axis=1)
     num_inliers = len(points)
     return Evidence(
         num_candidates,

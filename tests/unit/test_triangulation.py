@@ -7,12 +7,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from tests.unit.scenes import Scene, generator, make_scene
-from trigpoint.geometry.epipolar import homogeneous
+from trigpoint.geometry.points_last import project
 from trigpoint.geometry.triangulation import (
     Tracks,
-    intersect_rays,
     keep_agreeing,
-    project_tracks,
     triangulate,
     triangulate_robust,
 )
@@ -34,7 +32,7 @@ def noisy(scene: Scene, sigma: float) -> Tracks:
 
 def test_exact_observations_give_the_exact_points() -> None:
     scene = make_scene("exact")
-    points3d, _ = triangulate(scene.views_from_world, all_tracks(scene.points2d))
+    points3d = triangulate(scene.views_from_world, all_tracks(scene.points2d))
     np.testing.assert_allclose(points3d, scene.points3d, atol=1e-9)
 
 
@@ -45,10 +43,10 @@ def test_points_follow_when_the_world_is_moved_and_scaled(seed: int, scale: floa
     scene = make_scene(f"similarity {seed}", num_points=5, num_views=3)
     tracks = noisy(scene, 1e-3)
     moved_from_world = Rigid3(rotation_from_vector(rng.normal(size=3)), rng.normal(size=3) * 10)
-    points3d, _ = triangulate(scene.views_from_world, tracks)
+    points3d = triangulate(scene.views_from_world, tracks)
     views = scene.views_from_world @ moved_from_world.inverse()
     moved_views = Rigid3(views.R, views.t * scale)
-    moved, _ = triangulate(moved_views, tracks)
+    moved = triangulate(moved_views, tracks)
     np.testing.assert_allclose(
         moved, moved_from_world.apply(points3d) * scale, rtol=1e-6, atol=1e-6 * scale
     )
@@ -84,8 +82,9 @@ def test_triangulation_minimises_the_objective_of_proposition_2() -> None:
     views = scene.views_from_world
     views_from_first = views @ views[0].inverse()
     tracks = noisy(scene, 5e-3)
-    points3d, _ = triangulate(views, tracks, num_iterations=20)
-    residuals, _, _ = project_tracks(views, tracks, points3d)
+    points3d = triangulate(views, tracks, num_iterations=20)
+    seen = project(views, np.repeat(points3d, tracks.lengths, axis=0), tracks.view)
+    residuals = seen.xy.T - tracks.xy
     for j, X in enumerate(points3d):
         gammas = tracks.xy[tracks.point == j]
         in_first = views[0].apply(X)
@@ -105,30 +104,10 @@ def test_triangulation_minimises_the_objective_of_proposition_2() -> None:
         assert abs(objective(at, printed=True) - e1) > 10 * e1  # which the printed form is not
 
 
-def test_covariance_predicts_the_scatter() -> None:
-    sigma = 1e-3
-    scene = make_scene("scatter", num_points=20)
-    rng = generator("scatter noise")
-    errors = []
-    for _ in range(300):
-        noise = rng.normal(0, sigma, scene.points2d.shape)
-        points3d, covariance = triangulate(
-            scene.views_from_world, all_tracks(scene.points2d + noise)
-        )
-        errors.append(points3d - scene.points3d)
-    _, covariance = triangulate(scene.views_from_world, all_tracks(scene.points2d))
-    scatter = np.einsum("nmi,nmj->mij", errors, errors) / len(errors)
-    ratio = np.trace(scatter, axis1=1, axis2=2) / np.trace(covariance * sigma**2, axis1=1, axis2=2)
-    assert 0.9 < np.mean(ratio) < 1.1
-
-
-def test_parallel_rays_give_a_point_of_huge_uncertainty() -> None:
+def test_parallel_rays_give_a_point_far_away() -> None:
     views = Rigid3.from_center(np.tile(np.eye(3), (2, 1, 1)), np.array([[0, 0, 0], [1.0, 0, 0]]))
     tracks = Tracks(np.array([0, 0]), np.array([0, 1]), np.zeros((2, 2)), np.ones(2))
-    points3d, covariance = triangulate(views, tracks)
-    assert np.isfinite(points3d).all()
-    assert np.isfinite(covariance).all()
-    assert np.linalg.eigvalsh(covariance[0])[-1] > 1e6
+    assert np.isfinite(triangulate(views, tracks)).all()
 
 
 def test_two_views_at_one_place_give_finite_numbers() -> None:
@@ -137,9 +116,7 @@ def test_two_views_at_one_place_give_finite_numbers() -> None:
     tracks = Tracks(
         np.array([0, 0]), np.array([0, 1]), np.array([[0, 0], [-0.1003, 0]]), np.ones(2)
     )
-    points3d, covariance = triangulate(views, tracks)
-    assert np.isfinite(points3d).all()
-    assert np.isfinite(covariance).all()
+    assert np.isfinite(triangulate(views, tracks)).all()
 
 
 def test_a_point_behind_its_views_is_refused() -> None:
@@ -203,21 +180,6 @@ def test_no_tracks_give_no_points() -> None:
     assert len(triangulate_robust(scene.views_from_world, empty, max_error_px=1e-3).point) == 0
 
 
-def test_jacobian_of_the_projection_equals_the_numeric_one() -> None:
-    scene = make_scene("projection jacobian", num_points=4, num_views=3)
-    tracks = noisy(scene, 1e-3)
-    X = intersect_rays(scene.views_from_world, tracks)
-    r, J, in_front = project_tracks(scene.views_from_world, tracks, X)
-    assert in_front.all()
-    for axis in range(3):
-        step = 1e-6 * np.eye(3)[axis]
-        plus, _, _ = project_tracks(scene.views_from_world, tracks, X + step)
-        minus, _, _ = project_tracks(scene.views_from_world, tracks, X - step)
-        np.testing.assert_allclose(J[:, :, axis], (plus - minus) / 2e-6, atol=1e-8)
-    expected = homogeneous(tracks.xy + r)
-    np.testing.assert_allclose(expected[:, 2], 1.0)
-
-
 def test_a_pixel_is_as_large_as_its_view_sees_it() -> None:
     """The same error counts less in a view with large pixels, and may be too much in a fine one."""
     scene = make_scene("pixels", num_points=20, num_views=3)
@@ -227,7 +189,7 @@ def test_a_pixel_is_as_large_as_its_view_sees_it() -> None:
     coarse = replace(tracks, px=np.where(tracks.view == 2, 0.05, 0.001))
     fine = replace(tracks, px=np.full(len(tracks), 0.001))
     error_coarse, error_fine = (
-        np.linalg.norm(triangulate(scene.views_from_world, t)[0] - scene.points3d, axis=1)
+        np.linalg.norm(triangulate(scene.views_from_world, t) - scene.points3d, axis=1)
         for t in (coarse, fine)
     )
     assert (error_coarse < 0.1 * error_fine).all()

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tests.unit.scenes import generator, make_scene, project
 from trigpoint.frame import Reason
-from trigpoint.geometry.pose_refinement import RefinedPose
+from trigpoint.geometry.joint_refinement import RefinedPose
 from trigpoint.geometry.triangulation import Tracks
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import (
@@ -16,7 +16,6 @@ from trigpoint.stages import (
     Query,
     find_latent_points,
     refine,
-    refine_with_anchors,
     solve_latent_points,
 )
 from trigpoint.verdict import Evidence, gather_evidence, judge, measure_confidence, position_std
@@ -67,8 +66,6 @@ def solve(query: Query) -> tuple[Evidence, RefinedPose]:
     hypothesis = solve_latent_points(query, latent, OPTIONS)
     assert hypothesis is not None
     latent, refined = refine(query, hypothesis, OPTIONS)
-    assert refined is not None
-    refined = refine_with_anchors(query, latent, refined.cam_from_world, OPTIONS)
     assert refined is not None
     return gather_evidence(query, num_candidates, latent, refined, OPTIONS), refined
 
@@ -132,9 +129,6 @@ def test_anchors_at_one_place_give_no_certain_pose() -> None:
     if hypothesis is None:
         return
     latent, refined = refine(query, hypothesis, OPTIONS)
-    if refined is None:
-        return
-    refined = refine_with_anchors(query, latent, refined.cam_from_world, OPTIONS)
     if refined is not None:
         evidence = gather_evidence(query, 200, latent, refined, OPTIONS)
         assert objection(evidence, refined.covariance) is not None

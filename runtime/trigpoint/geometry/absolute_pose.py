@@ -48,7 +48,7 @@ def estimate_absolute_pose(
 def _poselib(points3d: Array, points2d: Array, max_error: float) -> Rigid3 | None:
     options = {
         "max_reproj_error": max_error,
-        "min_iterations": 50,
+        "min_iterations": 20,
         "max_iterations": 2000,
         "progressive_sampling": True,
         "seed": 0,

@@ -37,10 +37,12 @@ def sampson_error(E: Array, points_a: Array, points_b: Array) -> Array:
         x_b^T E x_a / sqrt((E x_a)_1^2 + (E x_a)_2^2 + (E^T x_b)_1^2 + (E^T x_b)_2^2), in the
         units of the points; 0 where the denominator vanishes (a point on both epipoles).
     """
-    a, b = homogeneous(points_a), homogeneous(points_b)
-    line_b = np.einsum("...ij,nj->ni", E, a) if E.ndim == 2 else np.einsum("nij,nj->ni", E, a)
-    line_a = np.einsum("ij,ni->nj", E, b) if E.ndim == 2 else np.einsum("nij,ni->nj", E, b)
-    algebraic = (b * line_b).sum(axis=1)
-    gradient = np.sqrt((line_b[:, :2] ** 2).sum(axis=1) + (line_a[:, :2] ** 2).sum(axis=1))
+    # Over the points at once: see `points_last`.
+    E = np.moveaxis(E, (-2, -1), (0, 1)) if E.ndim == 3 else E[..., None]
+    (xa, ya), (xb, yb) = np.ascontiguousarray(points_a.T), np.ascontiguousarray(points_b.T)
+    line_b = E[:, 0] * xa + E[:, 1] * ya + E[:, 2]
+    line_a = E[0, :2] * xb + E[1, :2] * yb + E[2, :2]
+    algebraic = line_b[0] * xb + line_b[1] * yb + line_b[2]
+    gradient = np.sqrt((line_b[:2] ** 2).sum(axis=0) + (line_a**2).sum(axis=0))
     error: Array = algebraic / np.maximum(gradient, np.finfo(float).tiny)
     return error

@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from trigpoint.geometry.epipolar import essential_matrix, homogeneous, sampson_error
-from trigpoint.rigid import Rigid3, rotate
+from trigpoint.geometry.epipolar import essential_matrix, sampson_error
+from trigpoint.geometry.points_last import invert_symmetric, multiply, project
+from trigpoint.rigid import Rigid3
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -90,20 +91,64 @@ class LatentPoints:
 
     Parameters
     ----------
-    point : (M,) int
-        Which points of the tracks.
     points3d : (M, 3) float64
         In the world.
-    covariance : (M, 3, 3) float64
-        For image noise of one pixel; scale by the variance of the noise in px^2.
     tracks : Tracks
         The observations they agree with, two at least for each.
     """
 
-    point: Index
     points3d: Array
-    covariance: Array
     tracks: Tracks
+
+    @property
+    def point(self) -> Index:
+        """Which points of the tracks (M,)."""
+        return self.tracks.groups()[0]
+
+
+def triangulate(
+    views_from_world: Rigid3,
+    tracks: Tracks,
+    *,
+    start: Array | None = None,
+    num_iterations: int = 1,
+) -> Array:
+    """Triangulate every point from all its observations.
+
+    Minimises E1 (paper, eq. 13): the sum of squared distances, in px, of a point's projections from
+    its observations. That is the objective of Proposition 2, which writes it in
+    the first view's point and depth: the third term of its sum must read rho^2 |g|^2 where the
+    paper prints rho |g|^2, since |rho R g + T|^2 = rho^2 |g|^2 + |T|^2 + 2 rho g^T R^T T. Over
+    X in the world it is the same minimum without singling out a view. Gauss-Newton.
+
+    Parameters
+    ----------
+    views_from_world : Rigid3
+        Poses of the views (V,).
+    tracks : Tracks
+        P observations of M points, each with two at least.
+    start : (M, 3) float64, optional
+        The points nearest to their rays by default.
+    num_iterations : int
+
+    Returns
+    -------
+    (M, 3) float64
+        In the order of `tracks.groups()`; for parallel rays some far point.
+    """
+    X: Array = intersect_rays(views_from_world, tracks) if start is None else start
+    _, starts = tracks.groups()
+    for _ in range(num_iterations):
+        seen = project(views_from_world, np.repeat(X, tracks.lengths, axis=0), tracks.view)
+        rows = np.empty((2, 4, len(tracks)))  # by the point, residual
+        rows[:, :3] = np.where(seen.in_front, seen.by_point / tracks.px, 0.0)
+        rows[:, 3] = (seen.xy - tracks.xy.T) / tracks.px
+        sums = np.add.reduceat(multiply(np.swapaxes(rows[:, :3], 0, 1), rows), starts, axis=-1)
+        H, g = sums[:, :3], sums[:, 3:]
+        # Parallel rays leave H singular: the point may then lie anywhere along them.
+        floor = (1e-9 * np.trace(H) + 1e-100) * np.eye(3)[..., None]
+        X = X - multiply(invert_symmetric(H + floor), g)[:, 0].T
+    return X
 
 
 def intersect_rays(views_from_world: Rigid3, tracks: Tracks) -> Array:
@@ -112,120 +157,30 @@ def intersect_rays(views_from_world: Rigid3, tracks: Tracks) -> Array:
     For each point the solution of sum (I - d d^T) X = sum (I - d d^T) c, as in Proposition 1, with
     weights 1 / px^2. Rays that are nearly parallel give a point far away, not an error.
     """
-    return _solve_rays(_ray_equations(views_from_world, tracks), tracks)
+    origin: Array = views_from_world.center.mean(axis=0)
+    return origin + _solve_rays(_ray_equations(views_from_world, tracks, origin), tracks)
 
 
-def _ray_equations(views_from_world: Rigid3, tracks: Tracks) -> Array:
-    """Say what each ray adds to its point's equations (P, 3, 5): I - d d^T, (I - d d^T) c, c."""
-    R = views_from_world.R[tracks.view]
-    d = rotate(np.swapaxes(R, 1, 2), homogeneous(tracks.xy))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    c = views_from_world.center[tracks.view]
-    normal = (np.eye(3) - d[:, :, None] * d[:, None, :]) / tracks.px[:, None, None] ** 2
-    return np.concatenate([normal, rotate(normal, c)[:, :, None], c[:, :, None]], axis=2)
+def _ray_equations(views_from_world: Rigid3, tracks: Tracks, origin: Array) -> Array:
+    """Say what each ray adds to its point's equations (4, 3, P): I - d d^T, (I - d d^T) c."""
+    R = np.ascontiguousarray(np.moveaxis(views_from_world.R, 0, -1))[:, :, tracks.view]
+    x, y = tracks.xy.T
+    d = R[0] * x + R[1] * y + R[2]
+    d /= np.sqrt((d**2).sum(axis=0))
+    c = np.ascontiguousarray((views_from_world.center - origin).T)[:, tracks.view]
+    equations = np.empty((4, 3, len(tracks)))
+    equations[:3] = (np.eye(3)[..., None] - d[:, None] * d) / tracks.px**2
+    equations[3] = multiply(equations[:3], c[:, None])[:, 0]
+    return equations
 
 
 def _solve_rays(equations: Array, tracks: Tracks) -> Array:
-    total = np.add.reduceat(equations, tracks.groups()[1])
-    A, b = total[:, :, :3], total[:, :, 3:4]
-    mean = total[:, :, 4:] / tracks.lengths[:, None, None]
-    # Parallel rays leave A singular along themselves: a tiny pull to the mean center settles it.
-    pull = 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None]
-    solution: Array = np.linalg.solve(A + pull * np.eye(3), b + pull * mean)[:, :, 0]
+    total = np.add.reduceat(equations, tracks.groups()[1], axis=-1)
+    A, b = total[:3], total[3]
+    # Parallel rays leave A singular along themselves: a tiny pull to the origin settles it.
+    pull = 1e-9 * np.trace(A) * np.eye(3)[..., None]
+    solution: Array = multiply(invert_symmetric(A + pull), b[:, None])[:, 0].T
     return solution
-
-
-def project_tracks(
-    views_from_world: Rigid3, tracks: Tracks, points3d: Array
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Residuals and Jacobians of every observation.
-
-    Parameters
-    ----------
-    views_from_world : Rigid3
-        The views (V,).
-    tracks : Tracks
-        P observations of M points.
-    points3d : (M, 3) float64
-        In the order of `tracks.groups()`.
-
-    Returns
-    -------
-    residuals : (P, 2) float64
-        Projection minus observation, in px.
-    jacobians : (P, 2, 3) float64
-        Of the projection by the point, in px.
-    in_front : (P,) bool
-    """
-    X = np.repeat(points3d, tracks.lengths, axis=0)
-    R = views_from_world.R[tracks.view]
-    Y = rotate(R, X) + views_from_world.t[tracks.view]
-    in_front = Y[:, 2] > 0
-    z = np.where(in_front, Y[:, 2], 1.0)
-    xy = Y[:, :2] / z[:, None]
-    jacobians = (R[:, :2] - xy[:, :, None] * R[:, 2:]) / (z * tracks.px)[:, None, None]
-    return (xy - tracks.xy) / tracks.px[:, None], jacobians, in_front
-
-
-def triangulate(
-    views_from_world: Rigid3, tracks: Tracks, *, num_iterations: int = 3
-) -> tuple[Array, Array]:
-    """Triangulate every point from all its observations.
-
-    Minimises E1 (paper, eq. 13): the sum of squared distances, in px, of a point's projections from
-    its observations. That is the objective of Proposition 2, which writes it in
-    the first view's point and depth: the third term of its sum must read rho^2 |g|^2 where the
-    paper prints rho |g|^2, since |rho R g + T|^2 = rho^2 |g|^2 + |T|^2 + 2 rho g^T R^T T. Over
-    X in the world it is the same minimum without singling out a view. Gauss-Newton from
-    `intersect_rays`, a step is kept where it lowers the point's cost, else it is halved.
-
-    Parameters
-    ----------
-    views_from_world : Rigid3
-        Poses of the views (V,).
-    tracks : Tracks
-        P observations of M points, each with two at least.
-    num_iterations : int
-        Gauss-Newton steps.
-
-    Returns
-    -------
-    points3d : (M, 3) float64
-        In the order of `tracks.groups()`; for parallel rays some far point.
-    covariance : (M, 3, 3) float64
-        Inverse of the normal matrix: the covariance for image noise of one pixel. Huge, never
-        infinite, where the rays are near parallel.
-    """
-    _, starts = tracks.groups()
-    X = intersect_rays(views_from_world, tracks)
-
-    def evaluate(X: Array) -> tuple[Array, Array, Array]:
-        r, J, in_front = project_tracks(views_from_world, tracks, X)
-        squares = np.where(in_front, (r**2).sum(axis=1), 1e12)
-        J = np.where(in_front[:, None, None], J, 0.0)
-        H = np.add.reduceat(np.swapaxes(J, 1, 2) @ J, starts)
-        g = np.add.reduceat((np.swapaxes(J, 1, 2) @ r[:, :, None])[:, :, 0], starts)
-        return np.add.reduceat(squares, starts), H, g
-
-    def regular(H: Array) -> Array:
-        # Parallel rays leave H singular: the point may then lie anywhere along them.
-        floor = 1e-12 * np.trace(H, axis1=1, axis2=2) + np.finfo(float).tiny
-        regular: Array = H + floor[:, None, None] * np.eye(3)
-        return regular
-
-    cost, H, g = evaluate(X)
-    size = np.ones(len(X))
-    for _ in range(num_iterations):
-        step = np.linalg.solve(regular(H), g[:, :, None])[:, :, 0]
-        candidate = X - size[:, None] * step
-        new_cost, new_H, new_g = evaluate(candidate)
-        better = new_cost <= cost
-        X = np.where(better[:, None], candidate, X)
-        H = np.where(better[:, None, None], new_H, H)
-        g = np.where(better[:, None], new_g, g)
-        cost = np.minimum(cost, new_cost)
-        size = np.where(better, 1.0, size / 2)
-    return X, np.linalg.inv(regular(H)).astype(np.float64, copy=False)
 
 
 def keep_agreeing(views_from_world: Rigid3, tracks: Tracks, *, max_error_px: float) -> Tracks:
@@ -274,23 +229,25 @@ def triangulate_robust(
     two observations or not at all. What is left is triangulated with `num_iterations`.
     """
     active = tracks.of_length(2)
-    equations = _ray_equations(views_from_world, active)
-    settled = [active[:0]]
+    origin = views_from_world.center.mean(axis=0)
+    equations = _ray_equations(views_from_world, active, origin)
+    settled, found = [active[:0]], [np.empty((0, 3))]
     while len(active):
         _, starts = active.groups()
         lengths = active.lengths
-        X = _solve_rays(equations, active)
-        Y = views_from_world[active.view].apply(np.repeat(X, lengths, axis=0))
-        in_front = Y[:, 2] > 0
-        z = np.where(in_front, Y[:, 2], 1.0)
-        r = Y[:, :2] / z[:, None] - active.xy
-        errors = np.where(in_front, np.sqrt((r**2).sum(axis=1)) / active.px, np.inf)
+        X = origin + _solve_rays(equations, active)
+        seen = project(views_from_world, np.repeat(X, lengths, axis=0), active.view)
+        distances = np.sqrt(((seen.xy - active.xy.T) ** 2).sum(axis=0)) / active.px
+        errors = np.where(seen.in_front, distances, np.inf)
         worst = np.maximum.reduceat(errors, starts)
-        done = np.repeat(worst <= max_error_px, lengths)
+        done = worst <= max_error_px
+        found.append(X[done])
+        done = np.repeat(done, lengths)
         settled.append(active[done])
         is_worst = errors == np.repeat(worst, lengths)
         left = active.in_groups_of(2, ~done & ~is_worst)
-        active, equations = active[left], equations[left]
-    kept = Tracks.concatenate(settled)
-    points3d, covariance = triangulate(views_from_world, kept, num_iterations=num_iterations)
-    return LatentPoints(kept.groups()[0], points3d, covariance, kept)
+        active, equations = active[left], equations[:, :, left]
+    order = np.argsort(np.concatenate([part.groups()[0] for part in settled]), kind="stable")
+    start, kept = np.concatenate(found)[order], Tracks.concatenate(settled)
+    X = triangulate(views_from_world, kept, start=start, num_iterations=num_iterations)
+    return LatentPoints(X, kept)
