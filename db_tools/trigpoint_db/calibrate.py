@@ -20,17 +20,9 @@ from scipy.spatial.transform import Rotation
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
 from trigpoint.frame import PoseNoise
+from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
-from trigpoint.models.matching import MutualNearestNeighbors
-from trigpoint.stages import (
-    LocalizerOptions,
-    find_latent_points,
-    match_anchors,
-    mean_distance,
-    refine,
-    solve_latent_points,
-)
-from trigpoint.verdict import gather_evidence, judge, measure_confidence
+from trigpoint.stages import LocalizerOptions, match_anchors, mean_distance
 
 Array = NDArray[np.float64]
 
@@ -40,6 +32,8 @@ MIN_TRIALS = 10
 # Grids of standard deviations: to 13 % of the anchors' distance, and 1.5 degrees.
 POSITION = np.append(0.0, 0.0005 * 2.0 ** np.arange(9))
 ROTATION_RAD = np.append(0.0, 0.0001 * 2.0 ** np.arange(9))
+# What the map says of its noise so far refuses no pose.
+OPTIONS = LocalizerOptions(generator="latent_points", max_position_std_ratio=1e5)
 STUDENT_DOF = 4.0  # errors have long tails: those of wrong poses must not set the noise
 
 
@@ -59,21 +53,19 @@ def calibrate_map(
     with MapReader.open(path, model.identity) as reader:
         spread = np.linspace(0, len(reader), NUM_IMAGES, endpoint=False).astype(int)
         images = np.unique(spread).tolist() if len(reader) else []
-        noise = measure_pose_noise(reader, LocalizerOptions(), model.long_side_px, track(images))
+        noise = measure_pose_noise(Localizer(model, reader, OPTIONS), track(images))
     with MapWriter.open(path, model.identity) as writer:
         writer.set_pose_noise(noise)
     return noise
 
 
-def measure_pose_noise(
-    reader: MapReader, options: LocalizerOptions, long_side_px: int, images: Iterable[int]
-) -> PoseNoise | None:
+def measure_pose_noise(localizer: Localizer, images: Iterable[int]) -> PoseNoise | None:
     """Measure the noise of a map's poses; None where too few images could be localized."""
     trials = [
         trial
         for index in images
         for gap in GAPS
-        if (trial := _try_image(reader, options, long_side_px, index, gap)) is not None
+        if (trial := _try_image(localizer, index, gap)) is not None
     ]
     if len(trials) < MIN_TRIALS:
         return None
@@ -97,9 +89,8 @@ def _fit(errors: Array, covariances: Array, distances: Array, levels: Array) -> 
     )
 
 
-def _try_image(
-    reader: MapReader, options: LocalizerOptions, long_side_px: int, index: int, gap: int
-) -> Trial | None:
+def _try_image(localizer: Localizer, index: int, gap: int) -> Trial | None:
+    reader, options = localizer.reader, localizer.options
     features, image = reader.features(index), reader.anchor(index)
     near = 2 * gap + 1
     found, _ = reader.search(
@@ -109,25 +100,17 @@ def _try_image(
     if len(others) < 2:
         return None
     anchors = [reader.anchor(int(other)) for other in others]
-    query = match_anchors(image.camera, features, anchors, MutualNearestNeighbors(), long_side_px)
-    latent = find_latent_points(query, options)
-    num_candidates = len(latent.point)
-    if num_candidates < options.min_inliers:
+    query = match_anchors(
+        image.camera, features, anchors, localizer.matcher, localizer.model.long_side_px
+    )
+    solution = localizer.solve(query)
+    if solution.refined is None or solution.seen is None:
         return None
-    start = solve_latent_points(query, latent, options)
-    if start is None:
-        return None
-    latent, refined = refine(query, start, options)
-    if refined is None:
-        return None
-    evidence = gather_evidence(query, num_candidates, latent, refined, options)
-    confidence = measure_confidence(evidence)
-    if judge(evidence, confidence, refined.covariance, options) is not None:
-        return None
-    truth, pose = image.cam_from_world, refined.cam_from_world
+    truth, pose = image.cam_from_world, solution.refined.cam_from_world
     dtheta = Rotation.from_matrix(truth.R.T @ pose.R).as_rotvec()
     error = np.concatenate([truth.center - pose.center, dtheta])
-    return Trial(error, refined.covariance, mean_distance(query, latent, pose))
+    distance = mean_distance(query, solution.seen, pose)
+    return Trial(error, solution.refined.covariance, distance)
 
 
 def _surprise(errors: Array, covariances: Array, std: Array) -> float:

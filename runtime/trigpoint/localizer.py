@@ -16,6 +16,7 @@ import numpy as np
 
 from trigpoint.database.reader import MapReader
 from trigpoint.frame import Frame, LocalFeatures, Localized, Lost, Reason, Result, Statistics
+from trigpoint.geometry.joint_refinement import RefinedPose
 from trigpoint.geometry.triangulation import LatentPoints
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import Matcher, MutualNearestNeighbors
@@ -43,6 +44,30 @@ NUM_LOOK_ALIKE = 20  # images that are looked at for doubles
 MAX_LESS_ALIKE = 0.1  # in cosine, than the best anchor
 MAX_DEPTHS = 10  # times the frame's median depth: from farther away nothing can be made out
 MIN_SEEN_SHARE = 0.1  # of what the frame was localized by, for an image of the same place
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What comes of a query's matches.
+
+    Parameters
+    ----------
+    result : Localized or Lost
+    is_certain : bool
+        More anchors are not needed.
+    refined : RefinedPose, optional
+        The pose that was given, with the covariance of the images alone.
+    seen : LatentPoints, optional
+        What it was localized by.
+    max_distance : float
+        From farther away nothing of that can be made out.
+    """
+
+    result: Result
+    is_certain: bool = False
+    refined: RefinedPose | None = None
+    seen: LatentPoints | None = None
+    max_distance: float = math.inf
 
 
 class Localizer:
@@ -94,6 +119,10 @@ class Localizer:
             if isinstance(turned, Localized):
                 return turned
         return result
+
+    def solve(self, query: Query) -> Solution:
+        """Solve for the pose with the anchors that a query is matched with, all at once."""
+        return self._solve(query, True, _Trace(None, Statistics()))
 
     def _localize(self, frame: Frame, statistics: Statistics, deadline: _Deadline) -> Result:
         options, trace = self.options, _Trace(self.clock, statistics)
@@ -166,7 +195,7 @@ class Localizer:
         features: LocalFeatures,
         taken: list[int],
         retrieved: dict[int, float],
-        solution: _Solution,
+        solution: Solution,
     ) -> list[int]:
         """Find images of other places, if one of them looks as much like the frame as the anchors.
 
@@ -187,7 +216,7 @@ class Localizer:
                 elsewhere.append(index)
         return [index for index in elsewhere if index not in taken][: self.options.first_anchors]
 
-    def _solve(self, query: Query, is_last: bool, trace: _Trace) -> _Solution:
+    def _solve(self, query: Query, is_last: bool, trace: _Trace) -> Solution:
         """Solve for the pose with the anchors there are."""
         options = self.options
         with trace.stage("latent_points"):
@@ -196,7 +225,7 @@ class Localizer:
         trace.note(num_candidates=num_candidates)
         if num_candidates < options.min_inliers:
             detail = f"{num_candidates} points in two anchors"
-            return _Solution(trace.lost(Reason.FEW_MATCHES, detail))
+            return Solution(trace.lost(Reason.FEW_MATCHES, detail))
 
         hypotheses: list[tuple[int, str, Rigid3]] = []  # supporters, generator, cam_from_world
         refusal = Reason.FEW_INLIERS
@@ -222,7 +251,7 @@ class Localizer:
                     hypotheses.append((support, "anchor_pairs", averaged[0]))
                     trace.note(num_consistent_anchors=averaged[1])
         if not hypotheses:
-            return _Solution(trace.lost(refusal, "no hypothesis of the pose"))
+            return Solution(trace.lost(refusal, "no hypothesis of the pose"))
 
         with trace.stage("refinement"):
             _, generator, hypothesis = max(hypotheses, key=lambda hypothesis: hypothesis[0])
@@ -230,7 +259,7 @@ class Localizer:
         trace.note(generator=generator, num_points=len(latent.point))
         if refined is None:
             detail = "the latent points do not determine a pose"
-            return _Solution(trace.lost(Reason.FEW_INLIERS, detail))
+            return Solution(trace.lost(Reason.FEW_INLIERS, detail))
 
         with trace.stage("verdict"):
             evidence = gather_evidence(query, num_candidates, latent, refined, options)
@@ -251,34 +280,13 @@ class Localizer:
             )
             objection = judge(evidence, confidence, covariance, options)
         if objection is not None:
-            return _Solution(trace.lost(*objection))
+            return Solution(trace.lost(*objection))
         is_certain = (
             confidence >= options.enough_confidence
             and evidence.std_ratio < options.enough_position_std_ratio
         )
         localized = Localized(refined.cam_from_world, covariance, trace.statistics)
-        return _Solution(localized, is_certain, latent, MAX_DEPTHS * evidence.depth)
-
-
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    """What came of one round.
-
-    Parameters
-    ----------
-    result : Localized or Lost
-    is_certain : bool
-        More anchors are not needed.
-    seen : LatentPoints, optional
-        What it was localized by.
-    max_distance : float
-        From farther away nothing of that can be made out.
-    """
-
-    result: Result
-    is_certain: bool = False
-    seen: LatentPoints | None = None
-    max_distance: float = math.inf
+        return Solution(localized, is_certain, refined, latent, MAX_DEPTHS * evidence.depth)
 
 
 def _round_size(num_taken: int, num_waiting: int, first: int) -> int:
