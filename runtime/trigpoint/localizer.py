@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from trigpoint.database.reader import MapReader
@@ -41,6 +42,7 @@ from trigpoint.verdict import gather_evidence, judge, measure_confidence, see_sh
 MIN_CONTRAST = 2.0  # standard deviation of the gray levels
 GROWTH = 3  # each round has so many times the anchors of the one before
 NUM_LOOK_ALIKE = 20  # images that are looked at for doubles
+MAX_SHOWN = 200  # points that images are asked for
 MAX_LESS_ALIKE = 0.1  # in cosine, than the best anchor
 MAX_DEPTHS = 10  # times the frame's median depth: from farther away nothing can be made out
 MIN_SEEN_SHARE = 0.1  # of what the frame was localized by, for an image of the same place
@@ -128,7 +130,7 @@ class Localizer:
         options, trace = self.options, _Trace(self.clock, statistics)
         if len(self.reader) == 0:
             return trace.lost(Reason.NO_MAP, "the map holds no image")
-        if (contrast := float(frame.image.std())) < MIN_CONTRAST:
+        if (contrast := cv2.meanStdDev(frame.image)[1].item()) < MIN_CONTRAST:
             return trace.lost(Reason.TOO_DARK, f"contrast {contrast:.1f} gray levels")
 
         with trace.stage("features"):
@@ -204,6 +206,7 @@ class Localizer:
         if solution.seen is None:
             return []
         points3d = solution.seen.points3d
+        points3d = points3d[:: math.ceil(len(points3d) / MAX_SHOWN)]
         support = [retrieved.get(taken[view], 0.0) for view in np.unique(solution.seen.tracks.view)]
         found, similarities = self.reader.search(features.global_descriptor, NUM_LOOK_ALIKE)
         num_alike = int((similarities > max(support) - MAX_LESS_ALIKE).sum())

@@ -55,7 +55,9 @@ class Rigid3:
             np.array([item.t for item in items]).reshape(-1, 3),
         )
 
-    def __getitem__(self, index: int | slice | NDArray[np.generic]) -> Rigid3:
+    def __getitem__(
+        self, index: int | slice | NDArray[np.generic] | tuple[slice | None, ...] | None
+    ) -> Rigid3:
         return Rigid3(self.R[index], self.t[index])
 
     def __len__(self) -> int:

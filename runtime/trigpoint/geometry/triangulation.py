@@ -16,6 +16,8 @@ from trigpoint.rigid import Rigid3
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+NUM_LEADERS = 8
+
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
@@ -188,26 +190,26 @@ def keep_agreeing(views_from_world: Rigid3, tracks: Tracks, *, max_error_px: flo
 
     Two observations agree that are within `max_error_px` of each other's epipolar lines. Where a
     point's observations are of two places, as in a repeated structure, those of one are left; from
-    all of them together no point could be triangulated that is near any.
+    all of them together no point could be triangulated that is near any. One of the first
+    `NUM_LEADERS` observations must be among them: in the views that come first.
     """
     tracks = tracks.of_length(2)
     if len(tracks) == 0:
         return tracks
     num, (_, starts), lengths = len(tracks), tracks.groups(), tracks.lengths
-    # Each observation with those of its point that come after it.
+    # Each leader with those of its point that come after it.
     index = np.arange(num)
-    following = np.repeat(starts + lengths, lengths) - index - 1
+    rank = index - np.repeat(starts, lengths)
+    following = np.where(rank < NUM_LEADERS, np.repeat(lengths, lengths) - rank - 1, 0)
     a = np.repeat(index, following)
     b = a + 1 + np.arange(len(a)) - np.repeat(np.cumsum(following) - following, following)
-    pair = tracks.view[b] * len(views_from_world) + tracks.view[a]
-    pairs, which = np.unique(pair, return_inverse=True)
-    view_b, view_a = np.divmod(pairs, len(views_from_world))
-    E = essential_matrix(views_from_world[view_b] @ views_from_world[view_a].inverse())
-    errors = np.abs(sampson_error(E[which], tracks.xy[a], tracks.xy[b]))
+    E = essential_matrix(views_from_world[:, None] @ views_from_world[None].inverse())
+    errors = np.abs(sampson_error(E[tracks.view[b], tracks.view[a]], tracks.xy[a], tracks.xy[b]))
     agree = errors < max_error_px * np.sqrt((tracks.px[a] ** 2 + tracks.px[b] ** 2) / 2)
     a, b = a[agree], b[agree]
 
     votes = np.bincount(a, minlength=num) + np.bincount(b, minlength=num)
+    votes[rank >= NUM_LEADERS] = -1
     most = np.maximum.reduceat(votes, starts)
     candidates = np.flatnonzero(votes == np.repeat(most, lengths))
     leader = candidates[np.searchsorted(candidates, starts)]  # of each point, the first of them
