@@ -63,6 +63,8 @@ def compare_times(cases: Cases, methods: Sequence[str]) -> str:
     rows = []
     for method in (*methods, HLOC):
         own = [case for found in of_method(cases, method).values() for case in found]
+        if not own:  # hloc was not there
+            continue
         stages = dict.fromkeys(stage for case in own for stage in case.stage_ms)
         times = {s: [c.stage_ms[s] for c in own if s in c.stage_ms] for s in stages}
         times["whole query"] = [case.ms for case in own]
