@@ -23,7 +23,7 @@ from trigpoint.database.reader import MapReader
 from trigpoint.frame import Localized
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
-from trigpoint.stages import LocalizerOptions
+from trigpoint.options import LocalizerOptions
 from trigpoint_db.build import read_frame
 from trigpoint_db.poses import read_queries
 

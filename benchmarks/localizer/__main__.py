@@ -26,8 +26,8 @@ from benchmarks.localizer.trials import run_trials
 from benchmarks.stage_times import describe_machine
 from trigpoint.errors import ConfigError, TrigpointError
 from trigpoint.models.features import FeatureModel
+from trigpoint.options import LocalizerOptions
 from trigpoint.output import check_output, open_text
-from trigpoint.stages import LocalizerOptions
 
 TABLES = ("accuracy", "anchors", "averaging", "trials")
 DEFAULT = "as many as needed"

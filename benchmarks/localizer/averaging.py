@@ -25,8 +25,9 @@ from trigpoint.geometry.translation_averaging import (
     average_translations,
     average_translations_govindu,
 )
+from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3, rotate, rotation_from_vector
-from trigpoint.stages import LocalizerOptions, average_poses
+from trigpoint.stages import average_poses
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.poses import read_names, read_queries
 

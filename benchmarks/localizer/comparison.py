@@ -20,8 +20,8 @@ from trigpoint.frame import Anchor, Frame, Localized, Result, Statistics
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import Matchable, MutualNearestNeighbors
+from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3, rotation_angle
-from trigpoint.stages import LocalizerOptions
 from trigpoint_db.build import build_map, read_frame, select_images
 from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.importers.colmap import read_model

@@ -26,8 +26,8 @@ from trigpoint.database.reader import MapReader
 from trigpoint.frame import Frame, Localized, Result, Statistics, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
+from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3, rotation_angle
-from trigpoint.stages import LocalizerOptions
 from trigpoint_db.build import build_map, read_frame, select_images
 from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.demo import CAMERA

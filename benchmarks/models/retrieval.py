@@ -15,7 +15,7 @@ from benchmarks.models.surveys import Survey, shrink
 from benchmarks.models.vlad import Vlad
 from trigpoint.database.ranking import POOL, choose_diverse, find_largest
 from trigpoint.images import read_gray
-from trigpoint.stages import LocalizerOptions
+from trigpoint.options import LocalizerOptions
 from trigpoint_db.poses import read_names
 
 RANKS = (1, 5, 10, 20)

@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from trigpoint.errors import ConfigError
 from trigpoint.models.features import Profile
+from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
-from trigpoint.stages import LocalizerOptions
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

@@ -22,7 +22,8 @@ from trigpoint.database.writer import MapWriter
 from trigpoint.frame import PoseNoise
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
-from trigpoint.stages import LocalizerOptions, match_anchors, mean_distance
+from trigpoint.options import LocalizerOptions
+from trigpoint.stages import match_anchors, mean_distance
 
 Array = NDArray[np.float64]
 

@@ -27,9 +27,9 @@ from trigpoint.frame import Failed, Localized, PoseNoise, describe, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel, find_model
 from trigpoint.models.matching import load_matcher
+from trigpoint.options import LocalizerOptions
 from trigpoint.output import check_output, open_text
 from trigpoint.rigid import Rigid3
-from trigpoint.stages import LocalizerOptions
 from trigpoint_db.adapt import adapt_model
 from trigpoint_db.build import append_map, build_map, check_files, select_images
 from trigpoint_db.calibrate import calibrate_map

@@ -21,10 +21,10 @@ from trigpoint.geometry.joint_refinement import RefinedPose
 from trigpoint.geometry.triangulation import LatentPoints
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import Matcher, MutualNearestNeighbors
+from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import (
     UNMEASURED,
-    LocalizerOptions,
     Query,
     average_poses,
     calibrate_covariance,

@@ -12,9 +12,9 @@ from trigpoint.camera import Camera
 from trigpoint.frame import Reason
 from trigpoint.geometry.joint_refinement import RefinedPose
 from trigpoint.geometry.triangulation import LatentPoints, keep_agreeing
+from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint.stages import (
-    LocalizerOptions,
     Query,
     count_support,
     find_latent_points,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from trigpoint.frame import Reason, Statistics
-from trigpoint.stages import LocalizerOptions
+from trigpoint.options import LocalizerOptions
 from trigpointd.config import Config
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -19,8 +19,9 @@ from trigpoint.frame import Frame, Localized, Lost, Reason, describe
 from trigpoint.images import read_gray
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
+from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3, rotation_angle
-from trigpoint.stages import LocalizerOptions, average_poses
+from trigpoint.stages import average_poses
 from trigpoint_db.demo import BODY_FROM_CAMERA, CAMERA
 from trigpoint_db.poses import read_poses
 

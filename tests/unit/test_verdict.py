@@ -10,9 +10,9 @@ from tests.unit.scenes import generator, make_scene, project
 from trigpoint.frame import Reason
 from trigpoint.geometry.joint_refinement import RefinedPose
 from trigpoint.geometry.triangulation import Tracks
+from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import (
-    LocalizerOptions,
     Query,
     find_latent_points,
     refine,
