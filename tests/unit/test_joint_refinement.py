@@ -10,7 +10,7 @@ from tests.unit.test_pose_refinement import errors
 from trigpoint.frame import PoseNoise
 from trigpoint.geometry.joint_refinement import RefinedPose, refine_jointly
 from trigpoint.geometry.points_last import project
-from trigpoint.geometry.pose_refinement import perturb, refine_pose
+from trigpoint.geometry.pose_refinement import MIN_POINTS, perturb, refine_pose
 from trigpoint.geometry.triangulation import LatentPoints, Tracks, triangulate
 from trigpoint.rigid import Rigid3
 
@@ -137,6 +137,14 @@ def test_the_unit_of_length_does_not_matter() -> None:
         np.testing.assert_allclose(
             other.cam_from_world.center / scale, one.cam_from_world.center, atol=1e-6
         )
+
+
+def test_wrong_matches_alone_give_no_pose_that_few_agree_with() -> None:
+    for trial in range(60):
+        survey = Survey(f"x{trial}", num_points=8)
+        survey.query += generator(f"w{trial}").uniform(-0.03, 0.03, (8, 2))
+        refined = survey.refine_jointly(survey.truth)
+        assert refined is None or refined.inliers.sum() >= MIN_POINTS
 
 
 def test_too_few_points_determine_no_pose() -> None:

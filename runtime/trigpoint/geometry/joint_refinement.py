@@ -100,9 +100,9 @@ def refine_jointly(
     Returns
     -------
     RefinedPose or None
-        None where the points do not determine the pose. The covariance is the query's block of the
-        inverse of the whole information matrix: of the image noise, scaled by the measured
-        residuals, and of the anchors' poses, which many points share.
+        None where fewer than four points agree or they do not determine the pose. The covariance is
+        the query's block of the inverse of the whole information matrix: of the image noise, scaled
+        by the measured residuals, and of the anchors' poses, which many points share.
     """
     distances = np.linalg.norm(views_from_world.center - cam_from_world.center, axis=1)
     problem = _Problem(
@@ -116,12 +116,11 @@ def refine_jointly(
     if not second.is_determined():
         return None
     end = second.step()
-    return RefinedPose(
-        end.cam_from_world,
-        second.covariance(),
-        problem.find_inliers(end),
-        np.moveaxis(second.points.covariance, -1, 0),
-    )
+    inliers = problem.find_inliers(end)
+    if inliers.sum() < MIN_POINTS:
+        return None
+    point_covariance = np.moveaxis(second.points.covariance, -1, 0)
+    return RefinedPose(end.cam_from_world, second.covariance(), inliers, point_covariance)
 
 
 @dataclass(frozen=True, eq=False)
