@@ -74,7 +74,6 @@ bench-localizer: $(READY)
 	$(BIN)/python -m benchmarks.localizer $(DATA) \
 	  $(if $(HLOC),--hloc '$(HLOC)') $(if $(EDGEPOINT2),--edgepoint2 '$(EDGEPOINT2)') \
 	  --output build/bench/localizer.md --picture build/bench/reliability.png
-	$(BIN)/python -m benchmarks.localizer.memory
 
 # The suite against the installed wheel, not the checkout.
 wheel-test: $(READY)

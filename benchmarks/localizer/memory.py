@@ -1,16 +1,10 @@
 """Memory over many localizations in a map of ten thousand images.
 
-    python -m benchmarks.localizer.memory [--images 10000] [--frames 10000]
-
 The map holds a rendered room and, for the rest, images with random features, all of 1024 keypoints.
-Prints what is resident, in MB, as the frames go by: of the process alone (anonymous), and of the
-map's pages, which the system drops when it needs them and which the process does not own.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -66,12 +60,8 @@ def resident_mb() -> dict[str, float]:
     return {name: int(found[name].split()[0]) / 1024 for name in ("RssAnon", "RssFile")}
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--images", type=int, default=10_000)
-    parser.add_argument("--frames", type=int, default=10_000)
-    arguments = parser.parse_args()
+def report(num_images: int = 10_000, num_frames: int = 10_000) -> str:
+    """Tabulate what is resident, in MB, as the frames go by."""
     threadpoolctl.threadpool_limits(1, user_api="blas")
     network = FeatureModel.load()
     rows = []
@@ -79,19 +69,13 @@ def main() -> None:
         path = Path(scratch) / "map.tpmap"
         # In a process of its own, which takes its memory with it.
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            frames = pool.submit(make_map, path, arguments.images).result()
+            frames = pool.submit(make_map, path, num_images).result()
         with MapReader.open(path, network.identity) as reader:
             localizer, num_localized = Localizer(network, reader), 0
-            for i in range(arguments.frames + 1):
-                if i in (0, 100) or (i > 0 and i % max(1, arguments.frames // 10) == 0):
-                    memory = resident_mb()
-                    rows.append([f"{i}", *(f"{value:.0f}" for value in memory.values())])
-                    print(rows[-1], file=sys.stderr, flush=True)
+            for i in range(num_frames + 1):
+                if i in (0, 100) or (i > 0 and i % max(1, num_frames // 10) == 0):
+                    rows.append([f"{i}", *(f"{value:.0f}" for value in resident_mb().values())])
                 result = localizer.localize(frames[i % len(frames)])
                 num_localized += isinstance(result, Localized)
-    print(markdown(["frames", "own", "the map's pages and libraries"], rows, num_words=0))
-    print(f"\n{num_localized} of {arguments.frames + 1} frames were localized.")
-
-
-if __name__ == "__main__":
-    main()
+    table = markdown(["frames", "own", "the map's pages and libraries"], rows, num_words=0)
+    return f"{table}\n\n{num_localized} of {num_frames + 1} frames were localized."
