@@ -128,22 +128,21 @@ def report(folders: Sequence[Path]) -> str:
                     errors.append(measure(anchors, moved(query, offset), noise_deg, rng))
             medians = np.median(errors, axis=0)
             by_noise.append([where, f"{noise_deg:g}", *(f"{100 * m:.2f}" for m in medians)])
+    tables = [markdown(["world's origin", "noise (deg)", *AVERAGES], by_noise)]
+    large = [(survey, queries) for survey, queries in sets if len(survey) >= MIN_ANCHORS]
+    if not large:
+        return tables[0]
     by_number = []
     for wrong_share in WRONG_SHARES:
         for num in NUM_ANCHORS:
             errors = [
                 measure(nearest(survey, query, num), query, 1.0, rng, wrong_share)
-                for survey, queries in sets
-                if len(survey) >= MIN_ANCHORS
+                for survey, queries in large
                 for i, query in enumerate(queries)
                 for rng in [np.random.default_rng(i)]
                 for _ in range(NUM_DRAWS)
             ]
             medians = np.median(errors, axis=0)
             by_number.append([f"{wrong_share:.0%}", f"{num}", *(f"{100 * m:.2f}" for m in medians)])
-    return "\n\n".join(
-        [
-            markdown(["world's origin", "noise (deg)", *AVERAGES], by_noise),
-            markdown(["wrong", "anchors", *AVERAGES], by_number),
-        ]
-    )
+    tables.append(markdown(["wrong", "anchors", *AVERAGES], by_number))
+    return "\n\n".join(tables)
