@@ -9,10 +9,9 @@ from tests.unit.scenes import generator, make_scene
 from tests.unit.test_pose_refinement import errors
 from trigpoint.frame import PoseNoise
 from trigpoint.geometry.joint_refinement import RefinedPose, refine_jointly
-from trigpoint.geometry.points_last import project
 from trigpoint.geometry.pose_refinement import MIN_POINTS, perturb, refine_pose
 from trigpoint.geometry.triangulation import LatentPoints, Tracks, triangulate
-from trigpoint.rigid import Rigid3
+from trigpoint.rigid import Rigid3, rotate
 
 PX = 1 / 500
 SIGMA_PX = 0.5
@@ -171,14 +170,18 @@ def test_the_points_covariance_predicts_their_scatter() -> None:
 
 
 def test_points_whose_rays_are_parallel_have_no_depth() -> None:
-    """All anchors at one place."""
+    """Of a point of two copies of a place the rays are parallel: it is as far as can be."""
     survey = Survey("joint parallel", EXACT)
-    survey.map = Rigid3.from_center(survey.map.R, np.tile(survey.map.center[0], (6, 1)))
-    tracks = survey.latent.tracks
-    seen = project(survey.map, survey.points[tracks.point], tracks.view)
-    survey.latent = LatentPoints(survey.points, replace(tracks, xy=seen.xy.T))
+    tracks, far = survey.latent.tracks, survey.latent.tracks.point < 10
+    sight = survey.truth.R.T @ np.array([0.05, 0.1, 1.0])
+    in_view = rotate(survey.map.R[tracks.view], sight)
+    xy = np.where(far[:, None], in_view[:, :2] / in_view[:, 2:], tracks.xy)
+    points3d = survey.latent.points3d.copy()
+    points3d[:10] = 1e5 * sight
+    survey.latent = LatentPoints(points3d, replace(tracks, xy=xy))
     refined = survey.refine_jointly(survey.truth, EXACT)
     assert refined is not None
-    distances = np.linalg.norm(survey.points - survey.map.center[0], axis=1)
+    distances = np.linalg.norm(points3d - survey.truth.center, axis=1)
     std = np.sqrt(np.linalg.eigvalsh(refined.point_covariance)[:, -1])
-    assert (std > 2 * distances).all()
+    assert (std[:10] > 0.5 * distances[:10]).all()
+    assert (std[10:] < 0.1 * distances[10:]).all()

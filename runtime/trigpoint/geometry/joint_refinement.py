@@ -119,8 +119,9 @@ def refine_jointly(
     inliers = problem.find_inliers(end)
     if inliers.sum() < MIN_POINTS:
         return None
-    point_covariance = np.moveaxis(second.points.covariance, -1, 0)
-    return RefinedPose(end.cam_from_world, second.covariance(), inliers, point_covariance)
+    return RefinedPose(
+        end.cam_from_world, second.covariance(), inliers, second.points.unbounded_covariance()
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,13 +135,19 @@ class _State:
 class _Points:
     """E1 with the points eliminated: how they follow the anchors, and what that asks of these."""
 
-    covariance: Array  # (3, 3, M)
+    normal: Array  # (3, 3, M)
+    covariance: Array  # (3, 3, M): its inverse, within bounds where rays are nearly parallel
     step: Array  # (3, M): to the minimum of E1
     gain: Array  # (M, 3, 6K): a change u of the anchors' errors moves them by -gain u
     information: Array  # (6K, 6K)
     gradient: Array  # (6K,)
     square: Array  # (P,): of the residuals, in sigma
     weight: Array  # (P,)
+
+    def unbounded_covariance(self) -> Array:
+        """Return the covariance (M, 3, 3) as large as it is, where rays are nearly parallel too."""
+        floor = (1e-12 * np.trace(self.normal) + 1e-100) * np.eye(3)[..., None]
+        return np.moveaxis(invert_symmetric(self.normal + floor), -1, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,4 +278,4 @@ class _Problem:
             sums = of_view @ of_view.T
             information[block, block] += sums[:6, :6]
             gradient[block] += sums[:6, 6]
-        return _Points(C, step, gain, information, gradient, square, weight)
+        return _Points(H, C, step, gain, information, gradient, square, weight)
