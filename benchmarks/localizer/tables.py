@@ -59,7 +59,7 @@ def compare_accuracy(cases: Cases, method: str) -> str:
 
 
 def compare_times(cases: Cases, methods: Sequence[str]) -> str:
-    """Medians and 99th percentiles of the stages, over all queries."""
+    """Medians, means and 99th percentiles of the stages, over all queries."""
     rows = []
     for method in (*methods, HLOC):
         own = [case for found in of_method(cases, method).values() for case in found]
@@ -70,9 +70,10 @@ def compare_times(cases: Cases, methods: Sequence[str]) -> str:
         times["whole query"] = [case.ms for case in own]
         for stage, spent in times.items():
             in_all = f"{len(spent) / len(own):.0%}"
-            numbers = (f"{np.median(spent):.1f}", f"{np.quantile(spent, 0.99):.1f}")
-            rows.append([method, stage, in_all, *numbers])
-    return markdown(["", "stage", "of queries", "median (ms)", "p99 (ms)"], rows, num_words=2)
+            numbers = np.median(spent), np.mean(spent), np.quantile(spent, 0.99)
+            rows.append([method, stage, in_all, *(f"{number:.1f}" for number in numbers)])
+    header = ["", "stage", "of queries", "median (ms)", "mean", "p99"]
+    return markdown(header, rows, num_words=2)
 
 
 def compare_anchors(cases: Cases, methods: Sequence[str], reference: str) -> str:

@@ -38,6 +38,7 @@ from trigpoint.rigid import Rigid3
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+MAX_SAMPLED = 600  # latent points for a hypothesis: with more its error is the same
 # Of a map that does not say: better too large.
 UNMEASURED = PoseNoise(0.0, 0.005, 0.001, 0.0)
 
@@ -231,7 +232,7 @@ def solve_latent_points(
 ) -> Rigid3 | None:
     """Latent points first: the query's pose by P3P in LO-RANSAC, with no relative pose at all."""
     # The more anchors agree on a point, the likelier it is right: sampled first.
-    order = np.argsort(-latent.tracks.lengths, kind="stable")
+    order = np.argsort(-latent.tracks.lengths, kind="stable")[:MAX_SAMPLED]
     return estimate_absolute_pose(
         latent.points3d[order],
         query.points[latent.point[order]],

@@ -53,7 +53,10 @@ def _poselib(points3d: Array, points2d: Array, max_error: float) -> Rigid3 | Non
         "progressive_sampling": True,
         "seed": 0,
     }
-    pose, info = poselib.estimate_absolute_pose(points2d, points3d, NORMALIZED_CAMERA, options, {})
+    refinement = {"max_iterations": 5}  # a start for ours is enough
+    pose, info = poselib.estimate_absolute_pose(
+        points2d, points3d, NORMALIZED_CAMERA, options, refinement
+    )
     if info["num_inliers"] < MIN_POINTS:
         return None
     return Rigid3(np.array(pose.R), np.array(pose.t))

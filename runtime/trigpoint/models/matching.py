@@ -119,8 +119,10 @@ def _mutual(similarity: NDArray[Any]) -> tuple[Index, NDArray[Any]]:
     # Against the column's maximum, not its arg-max: that is 20 times dearer in numpy.
     mutual = np.flatnonzero(best >= similarity.max(axis=0)[nearest])
     order = mutual[np.argsort(-best[mutual], kind="stable")]
-    # Of rows that are equally near to a column, the first.
-    order = order[np.sort(np.unique(nearest[order], return_index=True)[1])]
+    # Of rows that are equally near to a column, the first: it is written last.
+    owner = np.empty(similarity.shape[1], np.intp)
+    owner[nearest[order[::-1]]] = order[::-1]
+    order = order[owner[nearest[order]] == order]
     return np.stack([order, nearest[order]], axis=1), best[order]
 
 
