@@ -9,7 +9,7 @@ KITCHEN := $(DATA)/7scenes_redkitchen
 # Everyday pictures without poses, a tenth of which no training sees.
 PHOTOGRAPHS := ../shared/train_images/images
 
-.PHONY: demo test check golden bench bench-models bench-localizer wheel-test clean
+.PHONY: demo test check golden bench bench-models bench-localizer wheel-test test-oak clean
 
 # uv where it is installed, else venv and pip.
 $(READY): pyproject.toml
@@ -78,6 +78,15 @@ bench-localizer: $(READY)
 # The suite against the installed wheel, not the checkout.
 wheel-test: $(READY)
 	sh tests/run_against_wheel.sh
+
+# OAK cameras, without one: DepthAI is 350 MB, so the other targets leave it out.
+test-oak: $(READY)
+	@if command -v uv >/dev/null 2>&1; then \
+	  uv pip install --quiet --python $(BIN)/python --editable '.[oak]'; \
+	else \
+	  $(BIN)/python -m pip install --quiet --editable '.[oak]'; \
+	fi
+	$(BIN)/python -m pytest tests/daemon/test_depthai_source.py
 
 clean:
 	rm -rf .venv build dist

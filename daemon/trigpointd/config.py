@@ -7,11 +7,19 @@ import difflib
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
+from trigpoint.camera import MAX_SIDE_PX
 from trigpoint.errors import ConfigError
 from trigpoint.models.features import Profile
 from trigpoint.options import LocalizerOptions
@@ -28,13 +36,39 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class SourceConfig(Section):
-    """Where frames come from."""
+class McapConfig(Section):
+    """A recording that frames come from."""
 
     type: Literal["mcap"]
     path: Path
     image_topic: str | None = None  # needed where the recording has several
     rate: Annotated[float, Field(gt=0)] | None = None  # of the recorded pace; without: at once
+
+
+class DepthaiConfig(Section):
+    """An OAK camera that frames come from; it needs the extra `oak`."""
+
+    type: Literal["depthai"]
+    device: str | None = None  # id, USB port or IP address; without: the first found
+    socket: Annotated[str, Field(pattern=r"^CAM_[A-J]$")] = "CAM_A"
+    width: Annotated[int, Field(ge=1, le=MAX_SIDE_PX)] = 640
+    height: Annotated[int, Field(ge=1, le=MAX_SIDE_PX)] = 480
+    fps: Annotated[float, Field(gt=0)] = 30.0
+    max_exposure_ms: Annotated[float, Field(gt=0)] | None = None  # of the automatic exposure
+    exposure_ms: Annotated[float, Field(gt=0)] | None = None  # fixed, and so is `iso`
+    iso: Annotated[int, Field(gt=0)] | None = None
+    timeout_s: Annotated[float, Field(gt=0)] = 5.0  # without a frame the camera counts as lost
+
+    @model_validator(mode="after")
+    def _one_exposure(self) -> Self:
+        if (self.exposure_ms is None) != (self.iso is None):
+            raise ValueError("a fixed exposure needs both exposure_ms and iso")
+        if self.exposure_ms is not None and self.max_exposure_ms is not None:
+            raise ValueError("max_exposure_ms limits the automatic exposure; omit exposure_ms")
+        return self
+
+
+SOURCES: dict[int | str, type[Section]] = {"mcap": McapConfig, "depthai": DepthaiConfig}
 
 
 class CameraConfig(Section):
@@ -96,7 +130,7 @@ class Config(Section):
     map: Path
     base_key: Annotated[str, Field(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] = "trigpoint/device"
     map_frame: str = "map"  # frame_id of the poses
-    source: SourceConfig
+    source: Annotated[McapConfig | DepthaiConfig, Field(discriminator="type")]
     camera: CameraConfig = CameraConfig()
     model: ModelConfig = ModelConfig()
     localizer: LocalizerOptions = LocalizerOptions()
@@ -140,13 +174,17 @@ def _explain(error: ValidationError) -> str:
     unknown = ("extra_forbidden", "unexpected_keyword_argument")
     # A mistyped key is both unknown and missing: the former says more.
     first = min(error.errors(), key=lambda item: item["type"] not in unknown)
-    where = ".".join(str(part) for part in first["loc"])
+    where = ".".join(str(part) for part in first["loc"] if part not in SOURCES)
     if first["type"] in unknown:
         known = _keys(first["loc"][:-1])
         near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1, cutoff=0.0)
         return f"unknown key {where!r}; did you mean {near[0]!r}?"
     if first["type"] == "missing":
         return f"{where!r} is missing"
+    if first["type"] == "union_tag_not_found":
+        return f"'{where}.type' is missing; write one of {', '.join(map(repr, SOURCES))}"
+    if first["type"] == "union_tag_invalid":
+        return f"'{where}.type': {first['ctx']['tag']!r} is none of {first['ctx']['expected_tags']}"
     return f"{where!r}: {first['msg']} (it is {first['input']!r})"
 
 
@@ -154,6 +192,9 @@ def _keys(loc: tuple[int | str, ...]) -> list[str]:
     """List the keys of the table at a place in the file."""
     section: Any = Config
     for part in loc:
+        if part in SOURCES:  # of a union pydantic names the member that the type asks for
+            section = SOURCES[part]
+            continue
         annotation = section.model_fields[part].annotation
         section = next(
             kind for kind in (annotation, *get_args(annotation)) if isinstance(kind, type)

@@ -20,7 +20,7 @@ from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import load_matcher
 from trigpoint.output import check_output
-from trigpointd.config import Config
+from trigpointd.config import Config, McapConfig
 from trigpointd.latest import Latest
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.sd_notify import notify
@@ -29,6 +29,7 @@ from trigpointd.sinks.mcap import McapLog
 from trigpointd.sinks.poses import PoseFile
 from trigpointd.sinks.zenoh import ZenohSink
 from trigpointd.sources.base import Captured, Source
+from trigpointd.sources.depthai import DepthaiSource
 from trigpointd.sources.mcap import McapSource
 
 _log = logging.getLogger(__name__)
@@ -51,7 +52,9 @@ def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink
 
     `poses` names a file for the poses. What is written is opened after all that is read.
     """
-    inputs = (config.map, config.source.path)
+    inputs = [config.map]
+    if isinstance(config.source, McapConfig):
+        inputs.append(config.source.path)
     check_output(poses, *inputs)
     if config.log is not None:
         check_output(config.log.path, *inputs)
@@ -95,7 +98,9 @@ def open_pipeline(config: Config) -> Iterator[Pipeline]:
 def open_source(config: Config) -> Source:
     """Open the camera or the recording."""
     source = config.source
-    return McapSource(source.path, image_topic=source.image_topic, rate=source.rate)
+    if isinstance(source, McapConfig):
+        return McapSource(source.path, image_topic=source.image_topic, rate=source.rate)
+    return DepthaiSource(source)
 
 
 async def _run_until_signal(

@@ -115,13 +115,15 @@ def _image(path: Path) -> CompressedImage:
 
 def _calibration(camera: Camera) -> CameraCalibration:
     K = camera.K
-    fisheye = camera.model == "OPENCV_FISHEYE"
+    model = {"OPENCV_FISHEYE": "kannala_brandt", "FULL_OPENCV": "rational_polynomial"}.get(
+        camera.model, "plumb_bob"
+    )
     return CameraCalibration(
         frame_id=CAMERA_FRAME,
         width=camera.width,
         height=camera.height,
-        distortion_model="kannala_brandt" if fisheye else "plumb_bob",
-        D=camera.distortion if fisheye else [*camera.distortion, 0.0],  # plumb_bob: k3
+        distortion_model=model,
+        D=[*camera.distortion, 0.0] if model == "plumb_bob" else camera.distortion,  # the k3
         K=K.ravel(),
         R=[1, 0, 0, 0, 1, 0, 0, 0, 1],
         P=[*K[0], 0, *K[1], 0, *K[2], 0],

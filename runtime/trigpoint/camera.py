@@ -27,6 +27,7 @@ PARAMETERS: dict[str, tuple[str, ...]] = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 # cv2.undistortPoints iterates to a fixed point: a few steps are enough near the axis, some
 # hundred where a strong lens is nearly flat, at the corners of a 115 degree image.
@@ -132,11 +133,10 @@ class Camera:
 
     @cached_property
     def distortion(self) -> Array:
-        """OpenCV's distortion vector: k1 k2 p1 p2, or the fisheye's k1 k2 k3 k4."""
+        """OpenCV's vector: k1 k2 p1 p2, then FULL_OPENCV's k3 to k6; or the fisheye's k1 to k4."""
         names = PARAMETERS[self.model]
-        wanted = (
-            ("k1", "k2", "k3", "k4") if self.model == "OPENCV_FISHEYE" else ("k1", "k2", "p1", "p2")
-        )
+        whole = self.model in ("OPENCV_FISHEYE", "FULL_OPENCV")
+        wanted = names[4:] if whole else ("k1", "k2", "p1", "p2")
         values = [self._get(name) if name in names else 0.0 for name in wanted]
         return np.array(values, dtype=np.float64)
 

@@ -4,13 +4,19 @@ import numpy as np
 import pytest
 
 from trigpoint.errors import ConfigError
-from trigpointd.config import load_config
+from trigpointd.config import DepthaiConfig, McapConfig, load_config
 
 MINIMAL = """
 map = "place.tpmap"
 [source]
 type = "mcap"
 path = "flight.mcap"
+"""
+
+OAK = """
+map = "place.tpmap"
+[source]
+type = "depthai"
 """
 
 
@@ -23,6 +29,7 @@ def write(folder: Path, text: str) -> Path:
 def test_a_minimal_file_is_enough_and_paths_are_relative_to_it(tmp_path: Path) -> None:
     config = load_config(write(tmp_path, MINIMAL))
     assert config.map == tmp_path / "place.tpmap"
+    assert isinstance(config.source, McapConfig)
     assert config.source.path == tmp_path / "flight.mcap"
     assert config.localizer.num_anchors == 20
     assert config.zenoh is None
@@ -50,12 +57,22 @@ path = "/var/log/trigpoint.mcap"
 """
     )
     config = load_config(write(tmp_path, text))
+    assert isinstance(config.source, McapConfig)
     assert config.source.rate == 2.0
     assert config.localizer.num_anchors == 50
     assert config.log is not None
     assert config.log.path == Path("/var/log/trigpoint.mcap")
     # The camera's z axis, ahead, is the body's x axis.
     np.testing.assert_allclose(config.camera.body_from_camera.R @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+
+
+def test_an_oak_camera_needs_no_more_than_its_type(tmp_path: Path) -> None:
+    assert load_config(write(tmp_path, OAK)).source == DepthaiConfig(type="depthai")
+    text = 'device = "10.0.0.7"\nsocket = "CAM_B"\nfps = 15\nmax_exposure_ms = 4'
+    expected = DepthaiConfig(
+        type="depthai", device="10.0.0.7", socket="CAM_B", fps=15, max_exposure_ms=4
+    )
+    assert load_config(write(tmp_path, OAK + text)).source == expected
 
 
 @pytest.mark.parametrize(
@@ -70,7 +87,13 @@ path = "/var/log/trigpoint.mcap"
         (MINIMAL + "[localizer]\nmin_inliers = -3", "min_inliers must be positive"),
         (MINIMAL + "[localizer]\nnum_anchors = 'x'", "'localizer.num_anchors': .*valid integer"),
         (MINIMAL + "[camera]\nrotation_wxyz = [1, 1, 0, 0]", "unit quaternion"),
-        (MINIMAL.replace("mcap\"\npath", "video\"\npath"), "'source.type': Input should be 'mcap'"),
+        (MINIMAL.replace("mcap\"\npath", "video\"\npath"), "'source.type': 'video' is none of"),
+        (MINIMAL.replace("type", "tip"), "'source.type' is missing; write .*'depthai'"),
+        (OAK + "max_exposure = 2", "unknown key 'source.max_exposure'; .*'max_exposure_ms'"),
+        (OAK + "socket = 'CAM_Z'", "'source.socket': "),
+        (OAK + "fps = 0", "'source.fps': "),
+        (OAK + "exposure_ms = 2", "'source': .* needs both exposure_ms and iso"),
+        (OAK + "exposure_ms = 2\niso = 400\nmax_exposure_ms = 2", "omit exposure_ms"),
         ("base_key = '/x/'\n" + MINIMAL, "'base_key'"),
         (MINIMAL + "rate = nan", "'source.rate'"),
         (MINIMAL + "[localizer]\nnum_anchors = '20'", "'localizer.num_anchors': .*valid integer"),

@@ -28,6 +28,7 @@ ROS = get_typestore(Stores.ROS2_HUMBLE)
 TIME_NS = 1_700_000_000_123_456_789
 K = [500.0, 0, 320, 0, 510, 240, 0, 0, 1]
 P = [450.0, 0, 300, 0, 0, 460, 200, 0, 0, 0, 1, 0]
+RATIONAL = tuple(i / 10 for i in range(8))
 
 
 def smooth_image(width: int = 64, height: int = 48) -> NDArray[np.uint8]:
@@ -223,7 +224,9 @@ def test_garbage_for_a_calibration_is_an_error(kind: tuple[str, str]) -> None:
         ("plumb_bob", (0.0,) * 5, "PINHOLE", ()),
         ("plumb_bob", (0.1, -0.2, 0.01, 0.02), "OPENCV", (0.1, -0.2, 0.01, 0.02)),
         ("plumb_bob", (0.1, -0.2, 0.01, 0.02, 0.0), "OPENCV", (0.1, -0.2, 0.01, 0.02)),
+        ("plumb_bob", (0.1, 0, 0, 0, 0.2), "FULL_OPENCV", (0.1, 0, 0, 0, 0.2, 0, 0, 0)),
         ("rational_polynomial", (0.0, 0.1) + (0.0,) * 6, "OPENCV", (0.0, 0.1, 0.0, 0.0)),
+        ("rational_polynomial", (*RATIONAL, 0.0), "FULL_OPENCV", RATIONAL),
         ("kannala_brandt", (0.1, 0.2, 0.3, 0.4), "OPENCV_FISHEYE", (0.1, 0.2, 0.3, 0.4)),
         ("equidistant", (0.1, 0.2, 0.3, 0.4), "OPENCV_FISHEYE", (0.1, 0.2, 0.3, 0.4)),
         ("fisheye", (), "OPENCV_FISHEYE", (0.0, 0.0, 0.0, 0.0)),
@@ -268,8 +271,8 @@ def test_a_camera_that_was_never_calibrated_is_an_error(matrix: list[float]) -> 
 @pytest.mark.parametrize(
     ("unusable", "complaint"),
     [
-        (calibration("plumb_bob", (0.1, 0, 0, 0, 0.01)), "more than four"),
-        (calibration("rational_polynomial", (0.1, 0, 0, 0, 0, 0, 0, 0.1)), "more than four"),
+        (calibration("rational_polynomial", (*[0.1] * 8, 0, 0.2)), "more than 8"),
+        (calibration("fisheye", (0.1, 0, 0, 0, 0.01)), "more than 4"),
         (calibration("fisheye62", (0.1,)), "plumb_bob.*kannala_brandt"),
         (calibration("", (0.1,)), "plumb_bob.*kannala_brandt"),
         (Calibration("cam", 640, 480, "", (), K[:8], P), "8 numbers instead of 9"),

@@ -41,6 +41,7 @@ CAMERAS = [
     Camera("RADIAL", WIDTH, HEIGHT, (35, 19.5, 14.5, -0.1, 0.02)),
     Camera("OPENCV", WIDTH, HEIGHT, (35, 36, 19.5, 14.5, -0.1, 0.02, 0.003, -0.004)),
     Camera("OPENCV_FISHEYE", WIDTH, HEIGHT, (25, 26, 19.5, 14.5, 0.01, -0.02, 0.003, 0.001)),
+    Camera("FULL_OPENCV", WIDTH, HEIGHT, (25, 26, 19.5, 14.5, *(i / 100 for i in range(8)))),
 ]
 
 

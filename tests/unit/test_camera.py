@@ -20,10 +20,17 @@ CAMERAS = [
     Camera("RADIAL", 640, 480, (500.0, 321.0, 239.0, -0.2, 0.05)),
     Camera("OPENCV", 640, 480, (500.0, 510.0, 321.0, 239.0, -0.15, 0.04, 1e-3, -2e-3)),
     Camera("OPENCV_FISHEYE", 640, 480, (300.0, 305.0, 321.0, 239.0, 0.02, -0.01, 2e-3, -1e-3)),
+    # As a calibration of the rational model gives it: numerator and denominator nearly cancel.
+    Camera(
+        "FULL_OPENCV",
+        640,
+        480,
+        (500.0, 510.0, 321.0, 239.0, -1.85, -21.3, 1e-3, -1e-3, 104.8, -1.95, -20.9, 103.2),
+    ),
 ]
 every_camera = pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.model)
 image_points = arrays(np.float64, (7, 2), elements=st.floats(-0.9, 0.9))
-FISHEYE = CAMERAS[-1]
+FISHEYE = next(camera for camera in CAMERAS if camera.model == "OPENCV_FISHEYE")
 
 
 def distorted(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
@@ -36,7 +43,9 @@ def distorted(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
         series = 1 + k1 * theta**2 + k2 * theta**4 + p["k3"] * theta**6 + p["k4"] * theta**8
         scale = theta * series / np.where(r2 > 0, np.sqrt(r2), 1)
         return x * scale, y * scale
-    radial = 1 + k1 * r2 + k2 * r2**2
+    k3, k4, k5, k6 = (p.get(name, 0.0) for name in ("k3", "k4", "k5", "k6"))
+    numerator = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    radial = numerator / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     return (
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
         y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
@@ -164,7 +173,7 @@ def test_text_is_read_as_colmap_writes_it() -> None:
         ("PINHOLE 640", "cannot read a camera"),
         ("PINHOLE 640 480 500 500 x 240", "cannot read a camera"),
         ("PINHOLE 640.5 480 500 500 320 240", "cannot read a camera"),
-        ("FULL_OPENCV 640 480 500", "'FULL_OPENCV' is not known; use one of SIMPLE_PINHOLE"),
+        ("FOV 640 480 500", "'FOV' is not known; use one of SIMPLE_PINHOLE"),
         ("PINHOLE 640 480 500 320 240", r"takes 4 parameters \(fx fy cx cy\), not 3"),
         ("SIMPLE_PINHOLE 640 480 nan 320 240", "must be finite"),
         ("SIMPLE_PINHOLE 640 480 500 inf 240", "must be finite"),

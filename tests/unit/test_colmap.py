@@ -147,6 +147,7 @@ def test_other_files_of_a_model_are_not_looked_at(tmp_path: Path) -> None:
         (3, "RADIAL"),
         (4, "OPENCV"),
         (5, "OPENCV_FISHEYE"),
+        (6, "FULL_OPENCV"),
     ],
 )
 def test_every_camera_model_has_colmaps_number(tmp_path: Path, model_id: int, model: str) -> None:
@@ -228,7 +229,6 @@ def test_text_in_another_encoding_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("model_id", "model"),
     [
-        (6, "FULL_OPENCV"),
         (7, "FOV"),
         (8, "SIMPLE_RADIAL_FISHEYE"),
         (9, "RADIAL_FISHEYE"),

@@ -85,7 +85,7 @@ def test_a_query_written_as_text_reads_back(
         ("b.jpg PINHOLE 640 480 500 500 320", "takes 4 parameters"),
         ("b.jpg PINHOLE 640 480 500 500 320 x", "cannot read a camera"),
         ("b.jpg PINHOLE 640 480 500 500 320 inf", "must be finite"),
-        ("b.jpg FULL_OPENCV 640 480 500 500 320 240 0 0 0 0 0 0 0 0", "'FULL_OPENCV' is not known"),
+        ("b.jpg FOV 640 480 500 500 320 240 0.9", "'FOV' is not known"),
         ("a.jpg PINHOLE 640 480 500 500 320 240", "a.jpg is in this file twice"),
     ],
 )

@@ -53,20 +53,23 @@ def test_a_recording_holds_the_files_as_they_are_at_their_times(tmp_path: Path) 
 
 def test_a_calibration_precedes_each_change_of_the_camera(tmp_path: Path) -> None:
     fisheye = Camera("OPENCV_FISHEYE", 32, 24, (30, 31, 15.5, 11.5, 0.1, 0.2, 0.3, 0.4))
-    paths = write_images(tmp_path, 4)
-    cameras = [CAMERA, CAMERA, fisheye, CAMERA]
+    rational = Camera("FULL_OPENCV", 32, 24, (30, 31, 15.5, 11.5, *range(1, 9)))
+    paths = write_images(tmp_path, 5)
+    cameras = [CAMERA, CAMERA, fisheye, CAMERA, rational]
     out = tmp_path / "out.mcap"
     write_recording(out, map(RecordedImage, paths, cameras))
     found = read(out)
     kinds = [topic.removeprefix("/camera/")[0] for topic, _, _ in found]
-    assert "".join(kinds) == "ciicici"
-    first, second, third = (m for topic, _, m in found if topic == "/camera/calibration")
+    assert "".join(kinds) == "ciicicici"
+    first, second, third, fourth = (m for topic, _, m in found if topic == "/camera/calibration")
     assert first.distortion_model == third.distortion_model == "plumb_bob"
     assert list(first.D) == [0.1, -0.02, 0.003, -0.004, 0]
     assert list(first.K) == [30, 0, 15.5, 0, 31, 11.5, 0, 0, 1]
     assert (first.width, first.height) == (32, 24)
     assert second.distortion_model == "kannala_brandt"
     assert list(second.D) == [0.1, 0.2, 0.3, 0.4]
+    assert fourth.distortion_model == "rational_polynomial"
+    assert list(fourth.D) == [1, 2, 3, 4, 5, 6, 7, 8]
 
 
 def test_the_truth_is_where_the_camera_stood(tmp_path: Path) -> None:

@@ -173,20 +173,23 @@ def _camera_matrix(numbers: Sequence[float], columns: int) -> NDArray[np.float64
 
 def _lens(model: str, D: Sequence[float]) -> tuple[str, Sequence[float]]:
     """Translate a distortion into one of our models and its distortion parameters."""
-    first_four = (*D, 0.0, 0.0, 0.0, 0.0)[:4]
+    first_eight = (*D, *[0.0] * 8)[:8]
     if model not in _PINHOLE_MODELS + _FISHEYE_MODELS or (model == "" and any(D)):
         raise SourceError(
             f"distortion model {model!r} is not supported; use one of "
             f"{', '.join(_PINHOLE_MODELS[1:] + _FISHEYE_MODELS)}, or none"
         )
-    if any(D[4:]):
+    known = 4 if model in _FISHEYE_MODELS else 8
+    if any(D[known:]):
         raise SourceError(
-            f"the {model} distortion {tuple(D)} has more than four coefficients; calibrate with "
-            "k3 and higher fixed at 0, or as a fisheye"
+            f"the {model} distortion {tuple(D)} has more than {known} coefficients; calibrate with "
+            "the others fixed at 0"
         )
     if model in _FISHEYE_MODELS:
-        return "OPENCV_FISHEYE", first_four
-    return ("OPENCV", first_four) if any(D) else ("PINHOLE", ())
+        return "OPENCV_FISHEYE", first_eight[:4]
+    if any(D[4:]):
+        return "FULL_OPENCV", first_eight
+    return ("OPENCV", first_eight[:4]) if any(D) else ("PINHOLE", ())
 
 
 def _foxglove_time_ns(timestamp: Any) -> int:

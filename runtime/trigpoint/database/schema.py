@@ -39,12 +39,13 @@ FORMAT = 2
 BLOCK_ROWS = 256
 MAX_NAME_BYTES = 500  # LMDB's keys end at 511
 MAX_KEYPOINTS = 65_535
+MAX_CAMERA_PARAMETERS = 8
 
 METADATA_KEY = b"\x00"
 _CRC = struct.Struct("<I")
 _INDEX = struct.Struct("<I")
 # Quaternion and t, parameters, model; width, height, keypoints; how many of these lie here.
-_IMAGE = struct.Struct("<7d 8d 24s III H")
+_IMAGE = struct.Struct(f"<7d {MAX_CAMERA_PARAMETERS}d 24s III H")
 _MAX_INLINE_BYTES = 1024
 
 
@@ -167,7 +168,7 @@ def encode_image(
     header = _IMAGE.pack(
         *cam_from_world.quaternion,
         *cam_from_world.t,
-        *np.pad(camera.params, (0, 8 - len(camera.params))),
+        *np.pad(camera.params, (0, MAX_CAMERA_PARAMETERS - len(camera.params))),
         camera.model.encode(),
         camera.width,
         camera.height,

@@ -242,6 +242,11 @@ def _require_features(
             )
         if not np.isfinite(array).all():
             raise DatabaseError(f"{name!r} has {field} that are not finite")
+    if len(camera.params) > schema.MAX_CAMERA_PARAMETERS:
+        raise DatabaseError(
+            f"{name!r} has a {camera.model} camera, which a map cannot hold; calibrate with k3 and "
+            "higher fixed at 0 (OPENCV), or undistort the images"
+        )
     limit = (camera.width - 0.5, camera.height - 0.5)
     if ((features.keypoints < -0.5) | (features.keypoints > limit)).any():
         raise DatabaseError(
