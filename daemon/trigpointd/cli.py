@@ -18,7 +18,7 @@ from trigpoint.errors import TrigpointError
 from trigpoint.models.features import find_model
 from trigpoint.output import check_output, open_text
 from trigpoint.poses import format_pose
-from trigpointd.config import Config, LogConfig, ModelConfig, SourceConfig, ZenohConfig, load_config
+from trigpointd.config import Config, LogConfig, McapConfig, ModelConfig, ZenohConfig, load_config
 from trigpointd.service import open_pipeline, open_source, run
 from trigpointd.sinks.zenoh import make_settings
 from trigpointd.watch import Received, subscribe
@@ -61,7 +61,9 @@ def check_config(config: Annotated[Path, typer.Argument(help="Settings, a TOML f
     if settings.zenoh is not None:
         make_settings(settings.zenoh)
     with open_pipeline(settings):
-        asyncio.run(open_source(settings).close())
+        source = open_source(settings)
+        print(source.describe())
+        asyncio.run(source.close())
     print(f"{config}: good")
 
 
@@ -85,7 +87,7 @@ def replay(
     """Localize every frame of a recording, as fast as it goes."""
     config = Config(
         map=map_,
-        source=SourceConfig(type="mcap", path=recording, image_topic=topic),
+        source=McapConfig(type="mcap", path=recording, image_topic=topic),
         model=ModelConfig(network=find_model(model), retrieval=retrieval, matcher=matcher),
         log=None if log is None else LogConfig(path=log),
     )

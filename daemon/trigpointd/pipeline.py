@@ -74,6 +74,7 @@ class Pipeline:
             **describe(result),
             "latency_ms": round((time.perf_counter() - start_s) * 1e3, 3),
             "num_dropped": num_dropped,
+            "num_missed": captured.num_missed,
             "map_generation": self._reader.generation,
         }
         return Output(captured, result, pose, json.dumps(status).encode())

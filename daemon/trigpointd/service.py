@@ -20,7 +20,7 @@ from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import load_matcher
 from trigpoint.output import check_output
-from trigpointd.config import Config
+from trigpointd.config import Config, McapConfig, V4l2Config
 from trigpointd.latest import Latest
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.sd_notify import notify
@@ -30,6 +30,7 @@ from trigpointd.sinks.poses import PoseFile
 from trigpointd.sinks.zenoh import ZenohSink
 from trigpointd.sources.base import Captured, Source
 from trigpointd.sources.mcap import McapSource
+from trigpointd.sources.v4l2 import V4l2Source
 
 _log = logging.getLogger(__name__)
 
@@ -51,7 +52,9 @@ def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink
 
     `poses` names a file for the poses. What is written is opened after all that is read.
     """
-    inputs = (config.map, config.source.path)
+    inputs = [config.map]
+    if isinstance(config.source, McapConfig):
+        inputs.append(config.source.path)
     check_output(poses, *inputs)
     if config.log is not None:
         check_output(config.log.path, *inputs)
@@ -92,9 +95,11 @@ def open_pipeline(config: Config) -> Iterator[Pipeline]:
         yield Pipeline(localizer, reader, config.camera.body_from_camera, config.map_frame)
 
 
-def open_source(config: Config) -> Source:
-    """Open the camera or the recording."""
+def open_source(config: Config) -> McapSource | V4l2Source:
+    """Open the recording; a camera is opened when frames are asked for."""
     source = config.source
+    if isinstance(source, V4l2Config):
+        return V4l2Source(source)
     return McapSource(source.path, image_topic=source.image_topic, rate=source.rate)
 
 

@@ -3,14 +3,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
-from trigpointd.config import load_config
+from trigpointd.config import McapConfig, V4l2Config, load_config
 
 MINIMAL = """
 map = "place.tpmap"
 [source]
 type = "mcap"
 path = "flight.mcap"
+"""
+
+CAMERA = """
+map = "place.tpmap"
+[source]
+type = "v4l2"
+device = "/dev/video0"
+camera = "PINHOLE 640 480 460 461 320 240"
 """
 
 
@@ -23,6 +32,7 @@ def write(folder: Path, text: str) -> Path:
 def test_a_minimal_file_is_enough_and_paths_are_relative_to_it(tmp_path: Path) -> None:
     config = load_config(write(tmp_path, MINIMAL))
     assert config.map == tmp_path / "place.tpmap"
+    assert isinstance(config.source, McapConfig)
     assert config.source.path == tmp_path / "flight.mcap"
     assert config.localizer.num_anchors == 20
     assert config.zenoh is None
@@ -50,12 +60,21 @@ path = "/var/log/trigpoint.mcap"
 """
     )
     config = load_config(write(tmp_path, text))
+    assert isinstance(config.source, McapConfig)
     assert config.source.rate == 2.0
     assert config.localizer.num_anchors == 50
     assert config.log is not None
     assert config.log.path == Path("/var/log/trigpoint.mcap")
     # The camera's z axis, ahead, is the body's x axis.
     np.testing.assert_allclose(config.camera.body_from_camera.R @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+
+
+def test_a_cameras_intrinsics_are_read_as_colmap_writes_them(tmp_path: Path) -> None:
+    source = load_config(write(tmp_path, CAMERA)).source
+    assert isinstance(source, V4l2Config)
+    assert source.device == Path("/dev/video0")
+    assert source.camera == Camera("PINHOLE", 640, 480, (460, 461, 319.5, 239.5))
+    assert (source.format, source.fps) == ("YUYV", None)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +89,17 @@ path = "/var/log/trigpoint.mcap"
         (MINIMAL + "[localizer]\nmin_inliers = -3", "min_inliers must be positive"),
         (MINIMAL + "[localizer]\nnum_anchors = 'x'", "'localizer.num_anchors': .*valid integer"),
         (MINIMAL + "[camera]\nrotation_wxyz = [1, 1, 0, 0]", "unit quaternion"),
-        (MINIMAL.replace("mcap\"\npath", "video\"\npath"), "'source.type': Input should be 'mcap'"),
+        (MINIMAL.replace("mcap\"\npath", "video\"\npath"),
+         "'source.type': must be one of 'mcap', 'v4l2', not 'video'"),
+        (MINIMAL.replace("type =", "typ ="), "unknown key 'source.typ'; did you mean 'type'"),
+        (MINIMAL.replace('type = "mcap"', ""), "'source.type' is missing"),
+        (MINIMAL.replace('path = "flight.mcap"', ""), "'source.path' is missing"),
+        ("map = 'a'\nsource = 3", "'source': .*object"),
+        (CAMERA.replace("device", "devise"), "unknown key 'source.devise'; did you mean 'device'"),
+        (CAMERA.replace("PINHOLE", "PINEHOLE"), "'source.camera': .*'PINEHOLE' is not known; use"),
+        (CAMERA.replace(" 240", ""), "'source.camera': .*takes 4 parameters"),
+        (CAMERA + "format = 'RGB3'", "'source.format': Input should be 'YUYV', 'GREY'"),
+        (CAMERA + "fps = 0", "'source.fps': .*greater than 0"),
         ("base_key = '/x/'\n" + MINIMAL, "'base_key'"),
         (MINIMAL + "rate = nan", "'source.rate'"),
         (MINIMAL + "[localizer]\nnum_anchors = '20'", "'localizer.num_anchors': .*valid integer"),

@@ -14,7 +14,7 @@ from tests.conftest import Demo
 from trigpoint.frame import Localized
 from trigpoint.rigid import rotation_angle
 from trigpoint_db.poses import read_poses, write_poses
-from trigpointd.config import Config, SourceConfig
+from trigpointd.config import Config, McapConfig
 from trigpointd.pipeline import Output
 from trigpointd.service import run
 
@@ -38,7 +38,7 @@ class Collector:
 
 def test_the_flight_gives_the_golden_poses(demo: Demo, request: pytest.FixtureRequest) -> None:
     collector = Collector()
-    source = SourceConfig(type="mcap", path=demo.recording)
+    source = McapConfig(type="mcap", path=demo.recording)
     totals = run(Config(map=demo.map, source=source), extra_sinks=[collector])
     assert totals.num_dropped == 0
     poses = {
