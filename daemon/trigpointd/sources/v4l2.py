@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import math
 import os
 import select
 import time
@@ -25,7 +26,7 @@ _log = logging.getLogger(__name__)
 # The encoding of a raw image; None is a compressed one.
 _ENCODINGS = {"YUYV": "yuyv", "GREY": "mono8", "NV12": "nv12", "MJPG": None, "JPEG": None}
 _MAX_AGE_NS = 5 * 10**9
-_MAX_AHEAD_NS = 10**8  # some drivers stamp a frame with when it is due, up to 35 ms early
+_MAX_AHEAD_S = 0.1  # or a frame's period: some drivers stamp with when that ends
 _MAX_RATE_ERROR = 0.01
 _ABSENT = (errno.ENOENT, errno.ENODEV, errno.ENXIO)
 _HINTS = {
@@ -142,7 +143,7 @@ class V4l2Source:
 
     def _stream(self, device: VideoDevice, given: VideoFormat, wake: int) -> Iterator[Captured]:
         """Yield frames until woken; a camera that gives no usable one for long is an OSError."""
-        checks = _Checks(self._config, self._clock)
+        checks = _Checks(self._config, given, self._clock)
         timeout_s, usable_s = self._config.timeout_s, time.monotonic()
         problem = "it sends nothing"
         while True:
@@ -209,8 +210,9 @@ class V4l2Source:
 class _Checks:
     """What one stream's frames are held against: those before them, and the clock."""
 
-    def __init__(self, config: V4l2Config, clock: WallClock) -> None:
+    def __init__(self, config: V4l2Config, given: VideoFormat, clock: WallClock) -> None:
         self._allow_repeats = config.allow_repeats
+        self._max_ahead_ns = round(max(_MAX_AHEAD_S, 1 / (given.fps or math.inf)) * 1e9)
         self._clock = clock
         self._sequence: int | None = None
         self._data = b""
@@ -231,7 +233,7 @@ class _Checks:
         data, self._data = self._data, raw.data
         if raw.damaged:
             raise SourceError("the driver marks the frame as damaged")
-        if not now_ns - _MAX_AGE_NS <= stamp_ns <= now_ns + _MAX_AHEAD_NS:
+        if not now_ns - _MAX_AGE_NS <= stamp_ns <= now_ns + self._max_ahead_ns:
             ahead_s = (stamp_ns - now_ns) / 1e9
             raise SourceError(f"the frame's time stamp is {ahead_s:+.3f} s from its arrival")
         if stamp_ns <= self._newest_ns:
