@@ -14,14 +14,14 @@ class Backoff:
     def __init__(
         self, first_s: float = 0.1, max_s: float = 10.0, generator: random.Random | None = None
     ) -> None:
-        self.max_s = max_s
         self._first_s = self._next_s = first_s
+        self._max_s = max_s
         self._generator = generator or random.Random()
 
     def next_s(self) -> float:
         """Return the next delay."""
         delay_s = self._next_s * self._generator.uniform(0.5, 1.0)
-        self._next_s = min(2 * self._next_s, self.max_s)
+        self._next_s = min(2 * self._next_s, self._max_s)
         return delay_s
 
     def reset(self) -> None:

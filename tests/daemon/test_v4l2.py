@@ -57,10 +57,10 @@ def filled(i: int, **fields: Any) -> Filled:
     return Filled(yuyv(i), **{"sequence": i, **fields})
 
 
-def make_source(kernel: FakeKernel, **fields: Any) -> V4l2Source:
+def make_source(kernel: FakeKernel, backoff: Backoff | None = None, **fields: Any) -> V4l2Source:
     given = {"type": "v4l2", "device": Path("/dev/video7"), "camera": CAMERA, **fields}
     config = V4l2Config.model_validate(given)
-    return V4l2Source(config, kernel=kernel, backoff=Backoff(1e-3, 4e-3))
+    return V4l2Source(config, kernel=kernel, backoff=backoff or Backoff(1e-3, 4e-3))
 
 
 async def collect(source: Source, count: int) -> list[Captured]:
@@ -402,6 +402,13 @@ def test_a_camera_that_falls_silent_is_opened_again(log: pytest.LogCaptureFixtur
     ]
 
 
+def test_after_a_stream_that_lasted_delays_begin_with_the_shortest() -> None:
+    kernel = FakeKernel(*[Plugged()] * 25, Plugged([filled(0)]))
+    # The last delay would be of hours, were each twice the one before.
+    source = make_source(kernel, Backoff(1e-3, 1e9), timeout_s=0.01)
+    assert details(asyncio.run(collect(source, 1))) == [""]
+
+
 def test_a_camera_that_gives_only_bad_frames_is_opened_again(log: pytest.LogCaptureFixture) -> None:
     bad = [filled(0, flags=v4l2.BUF_FLAG_ERROR)]
     source = make_source(FakeKernel(Plugged(bad * 100_000), Plugged([filled(1)])), timeout_s=0.05)
@@ -431,8 +438,7 @@ def test_it_can_be_ended_whatever_it_does_and_leaves_nothing_open(state: str) ->
         "holds a frame": [Plugged([filled(0), filled(1)])],
     }
     kernel = FakeKernel(*cameras[state])
-    config = V4l2Config.model_validate({"type": "v4l2", "device": "/dev/video7", "camera": CAMERA})
-    source = V4l2Source(config, kernel=kernel, backoff=Backoff(3600, 3600))
+    source = make_source(kernel, Backoff(3600, 3600))
 
     async def begin_and_end() -> None:
         async with contextlib.aclosing(source.frames()) as frames:

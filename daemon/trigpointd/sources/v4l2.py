@@ -120,7 +120,7 @@ class V4l2Source:
                 if not self._delivered:
                     raise SourceError(f"camera {self._config.device}: {error}") from error
                 self._report(0, error)
-            if time.monotonic() - start_s > self._backoff.max_s:
+            if time.monotonic() - start_s > self._config.timeout_s:
                 self._backoff.reset()
             if _wait(wake, timeout_s=self._backoff.next_s()):
                 return

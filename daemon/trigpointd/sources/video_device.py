@@ -1,4 +1,7 @@
-"""A V4L2 capture device: set up, mapped into memory, and its frames taken one by one."""
+"""A V4L2 capture device: set up, mapped into memory, and its frames taken one by one.
+
+OpenCV tells neither sequence numbers nor which frames are damaged, and linuxpy is GPL.
+"""
 
 from __future__ import annotations
 
