@@ -9,7 +9,7 @@ KITCHEN := $(DATA)/7scenes_redkitchen
 # Everyday pictures without poses, a tenth of which no training sees.
 PHOTOGRAPHS := ../shared/train_images/images
 
-.PHONY: demo test check golden bench bench-models bench-localizer wheel-test test-oak clean
+.PHONY: demo test test-oak test-v4l2 check golden bench bench-models bench-localizer wheel-test clean
 
 # uv where it is installed, else venv and pip.
 $(READY): pyproject.toml
@@ -38,6 +38,10 @@ check: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python -m pytest
+
+# The camera source on a real kernel's virtual camera, in qemu; about a minute.
+test-v4l2: $(READY)
+	sh tests/v4l2/boot.sh $(abspath $(BIN))/python
 
 # Re-record the poses that the replay tests compare with.
 golden: $(READY)

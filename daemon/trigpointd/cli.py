@@ -61,7 +61,9 @@ def check_config(config: Annotated[Path, typer.Argument(help="Settings, a TOML f
     if settings.zenoh is not None:
         make_settings(settings.zenoh)
     with open_pipeline(settings):
-        asyncio.run(open_source(settings).close())
+        source = open_source(settings)
+        print(source.describe())
+        asyncio.run(source.close())
     print(f"{config}: good")
 
 

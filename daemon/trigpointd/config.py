@@ -14,12 +14,13 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    PlainValidator,
     ValidationError,
     field_validator,
     model_validator,
 )
 
-from trigpoint.camera import MAX_SIDE_PX
+from trigpoint.camera import MAX_SIDE_PX, Camera
 from trigpoint.errors import ConfigError
 from trigpoint.models.features import Profile
 from trigpoint.options import LocalizerOptions
@@ -37,7 +38,7 @@ class Section(BaseModel):
 
 
 class McapConfig(Section):
-    """A recording that frames come from."""
+    """Frames come from a recording."""
 
     type: Literal["mcap"]
     path: Path
@@ -45,8 +46,29 @@ class McapConfig(Section):
     rate: Annotated[float, Field(gt=0)] | None = None  # of the recorded pace; without: at once
 
 
+def _parse_camera(text: object) -> Camera:
+    if not isinstance(text, str):
+        raise ValueError("must be a text, 'MODEL width height params...'")  # noqa: TRY004
+    try:
+        return Camera.from_text(text)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+
+
+class V4l2Config(Section):
+    """Frames come from a camera that Linux knows as a video device."""
+
+    type: Literal["v4l2"]
+    device: Path
+    camera: Annotated[Camera, PlainValidator(_parse_camera)]  # intrinsics; its size is asked for
+    format: Literal["YUYV", "GREY", "NV12", "MJPG"] = "YUYV"
+    fps: Annotated[float, Field(gt=0, le=1000)] | None = None  # without: the driver's choice
+    timeout_s: Annotated[float, Field(gt=0)] = 5.0  # without a usable frame: opened again
+    allow_repeats: bool = False  # pictures that are the same to the byte, as simulations give
+
+
 class DepthaiConfig(Section):
-    """An OAK camera that frames come from; it needs the extra `oak`."""
+    """Frames come from an OAK camera; it needs the extra `oak`."""
 
     type: Literal["depthai"]
     device: str | None = None  # id, USB port or IP address; without: the first found
@@ -68,7 +90,12 @@ class DepthaiConfig(Section):
         return self
 
 
-SOURCES: dict[int | str, type[Section]] = {"mcap": McapConfig, "depthai": DepthaiConfig}
+SourceConfig = Annotated[McapConfig | V4l2Config | DepthaiConfig, Field(discriminator="type")]
+_SOURCES: dict[int | str, type[Section]] = {
+    "mcap": McapConfig,
+    "v4l2": V4l2Config,
+    "depthai": DepthaiConfig,
+}
 
 
 class CameraConfig(Section):
@@ -174,17 +201,22 @@ def _explain(error: ValidationError) -> str:
     unknown = ("extra_forbidden", "unexpected_keyword_argument")
     # A mistyped key is both unknown and missing: the former says more.
     first = min(error.errors(), key=lambda item: item["type"] not in unknown)
-    where = ".".join(str(part) for part in first["loc"] if part not in SOURCES)
+    loc = first["loc"]
+    # After `source` pydantic puts the type that chose among its tables.
+    where = ".".join(str(part) for i, part in enumerate(loc) if (i, loc[0]) != (1, "source"))
     if first["type"] in unknown:
-        known = _keys(first["loc"][:-1])
-        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1, cutoff=0.0)
+        known = _keys(loc[:-1])
+        near = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=0.0)
         return f"unknown key {where!r}; did you mean {near[0]!r}?"
+    if first["type"] == "union_tag_not_found":
+        near = difflib.get_close_matches("type", first["input"], n=1)
+        mistyped = f"unknown key '{where}.{near[0]}'; did you mean 'type'?" if near else ""
+        return mistyped or f"'{where}.type' is missing"
+    if first["type"] == "union_tag_invalid":
+        context = first["ctx"]
+        return f"'{where}.type': must be one of {context['expected_tags']}, not {context['tag']!r}"
     if first["type"] == "missing":
         return f"{where!r} is missing"
-    if first["type"] == "union_tag_not_found":
-        return f"'{where}.type' is missing; write one of {', '.join(map(repr, SOURCES))}"
-    if first["type"] == "union_tag_invalid":
-        return f"'{where}.type': {first['ctx']['tag']!r} is none of {first['ctx']['expected_tags']}"
     return f"{where!r}: {first['msg']} (it is {first['input']!r})"
 
 
@@ -192,8 +224,8 @@ def _keys(loc: tuple[int | str, ...]) -> list[str]:
     """List the keys of the table at a place in the file."""
     section: Any = Config
     for part in loc:
-        if part in SOURCES:  # of a union pydantic names the member that the type asks for
-            section = SOURCES[part]
+        if part in _SOURCES:
+            section = _SOURCES[part]
             continue
         annotation = section.model_fields[part].annotation
         section = next(

@@ -20,7 +20,7 @@ from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import load_matcher
 from trigpoint.output import check_output
-from trigpointd.config import Config, McapConfig
+from trigpointd.config import Config, McapConfig, V4l2Config
 from trigpointd.latest import Latest
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.sd_notify import notify
@@ -31,6 +31,7 @@ from trigpointd.sinks.zenoh import ZenohSink
 from trigpointd.sources.base import Captured, Source
 from trigpointd.sources.depthai import DepthaiSource
 from trigpointd.sources.mcap import McapSource
+from trigpointd.sources.v4l2 import V4l2Source
 
 _log = logging.getLogger(__name__)
 
@@ -95,12 +96,12 @@ def open_pipeline(config: Config) -> Iterator[Pipeline]:
         yield Pipeline(localizer, reader, config.camera.body_from_camera, config.map_frame)
 
 
-def open_source(config: Config) -> Source:
-    """Open the camera or the recording."""
+def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
+    """Open the recording; a camera is opened when frames are asked for."""
     source = config.source
     if isinstance(source, McapConfig):
         return McapSource(source.path, image_topic=source.image_topic, rate=source.rate)
-    return DepthaiSource(source)
+    return V4l2Source(source) if isinstance(source, V4l2Config) else DepthaiSource(source)
 
 
 async def _run_until_signal(

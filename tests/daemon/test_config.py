@@ -3,8 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
-from trigpointd.config import DepthaiConfig, McapConfig, load_config
+from trigpointd.config import DepthaiConfig, McapConfig, V4l2Config, load_config
 
 MINIMAL = """
 map = "place.tpmap"
@@ -17,6 +18,14 @@ OAK = """
 map = "place.tpmap"
 [source]
 type = "depthai"
+"""
+
+CAMERA = """
+map = "place.tpmap"
+[source]
+type = "v4l2"
+device = "/dev/video0"
+camera = "PINHOLE 640 480 460 461 320 240"
 """
 
 
@@ -75,6 +84,14 @@ def test_an_oak_camera_needs_no_more_than_its_type(tmp_path: Path) -> None:
     assert load_config(write(tmp_path, OAK + text)).source == expected
 
 
+def test_a_cameras_intrinsics_are_read_as_colmap_writes_them(tmp_path: Path) -> None:
+    source = load_config(write(tmp_path, CAMERA)).source
+    assert isinstance(source, V4l2Config)
+    assert source.device == Path("/dev/video0")
+    assert source.camera == Camera("PINHOLE", 640, 480, (460, 461, 319.5, 239.5))
+    assert (source.format, source.fps) == ("YUYV", None)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -87,13 +104,22 @@ def test_an_oak_camera_needs_no_more_than_its_type(tmp_path: Path) -> None:
         (MINIMAL + "[localizer]\nmin_inliers = -3", "min_inliers must be positive"),
         (MINIMAL + "[localizer]\nnum_anchors = 'x'", "'localizer.num_anchors': .*valid integer"),
         (MINIMAL + "[camera]\nrotation_wxyz = [1, 1, 0, 0]", "unit quaternion"),
-        (MINIMAL.replace("mcap\"\npath", "video\"\npath"), "'source.type': 'video' is none of"),
-        (MINIMAL.replace("type", "tip"), "'source.type' is missing; write .*'depthai'"),
         (OAK + "max_exposure = 2", "unknown key 'source.max_exposure'; .*'max_exposure_ms'"),
         (OAK + "socket = 'CAM_Z'", "'source.socket': "),
         (OAK + "fps = 0", "'source.fps': "),
         (OAK + "exposure_ms = 2", "'source': .* needs both exposure_ms and iso"),
         (OAK + "exposure_ms = 2\niso = 400\nmax_exposure_ms = 2", "omit exposure_ms"),
+        (MINIMAL.replace("mcap\"\npath", "video\"\npath"),
+         "'source.type': must be one of 'mcap', 'v4l2', 'depthai', not 'video'"),
+        (MINIMAL.replace("type =", "typ ="), "unknown key 'source.typ'; did you mean 'type'"),
+        (MINIMAL.replace('type = "mcap"', ""), "'source.type' is missing"),
+        (MINIMAL.replace('path = "flight.mcap"', ""), "'source.path' is missing"),
+        ("map = 'a'\nsource = 3", "'source': .*object"),
+        (CAMERA.replace("device", "devise"), "unknown key 'source.devise'; did you mean 'device'"),
+        (CAMERA.replace("PINHOLE", "PINEHOLE"), "'source.camera': .*'PINEHOLE' is not known; use"),
+        (CAMERA.replace(" 240", ""), "'source.camera': .*takes 4 parameters"),
+        (CAMERA + "format = 'RGB3'", "'source.format': Input should be 'YUYV', 'GREY'"),
+        (CAMERA + "fps = 0", "'source.fps': .*greater than 0"),
         ("base_key = '/x/'\n" + MINIMAL, "'base_key'"),
         (MINIMAL + "rate = nan", "'source.rate'"),
         (MINIMAL + "[localizer]\nnum_anchors = '20'", "'localizer.num_anchors': .*valid integer"),

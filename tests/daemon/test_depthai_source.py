@@ -30,7 +30,9 @@ from trigpoint.frame import Frame
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.rigid import Rigid3
+from trigpointd.backoff import Backoff
 from trigpointd.config import DepthaiConfig
+from trigpointd.messages.images import parse_calibration, parse_image, to_frame
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.service import serve
 from trigpointd.sources.base import BadFrame, Captured
@@ -160,7 +162,7 @@ class Device:
 
 def source_of(device: Device, timeout_s: float = GUARD_S) -> DepthaiSource:
     config = DepthaiConfig(type="depthai", timeout_s=timeout_s)
-    return DepthaiSource(config, open_pipeline=device.open, delays_s=lambda: itertools.repeat(0.0))
+    return DepthaiSource(config, open_pipeline=device.open, backoff=Backoff(0.0))
 
 
 async def take(source: DepthaiSource, count: int) -> list[Captured]:
@@ -369,20 +371,44 @@ def test_a_camera_that_is_lost_comes_back(
 
 
 def test_delays_start_anew_once_there_were_frames() -> None:
-    drawn: list[list[int]] = []
+    drawn = [0]
 
-    def delays_s() -> Iterator[float]:
-        drawn.append([])
-        for i in itertools.count():
-            drawn[-1].append(i)
-            yield 0.0
+    class Counting(Backoff):
+        def next_s(self) -> float:
+            drawn[-1] += 1
+            return 0.0
+
+        def reset(self) -> None:
+            drawn.append(0)
 
     gone = RuntimeError("gone")
     device = Device(gone, gone, gone, [image(0), UNPLUGGED], gone, [image(1)])
     config = DepthaiConfig(type="depthai", timeout_s=GUARD_S)
-    source = DepthaiSource(config, open_pipeline=device.open, delays_s=delays_s)
+    source = DepthaiSource(config, open_pipeline=device.open, backoff=Counting())
     assert len(asyncio.run(take(source, 2))) == 2
-    assert [used for used in drawn if used] == [[0, 1, 2], [0, 1]]
+    assert drawn == [3, 2, 0]
+
+
+def test_a_description_is_of_what_comes() -> None:
+    source = source_of(Device([image(0)]))
+    assert source.describe() == f"CAM_A gives {WIDTH} x {HEIGHT} px"
+    asyncio.run(source.close())
+    with pytest.raises(SourceError, match="no device"):
+        source_of(Device(RuntimeError("no device"))).describe()
+
+
+def test_what_is_logged_of_a_frame_makes_it_again() -> None:
+    (captured,) = asyncio.run(take(source_of(Device([image(3)])), 1))
+    assert isinstance(captured.frame, Frame)
+    assert captured.image is not None
+    assert captured.calibration is not None
+    kinds = [(m.channel.message_encoding, m.channel.schema_name, m.data)
+             for m in (captured.image, captured.calibration)]  # fmt: skip
+    shown, camera = parse_image(*kinds[0]), parse_calibration(*kinds[1]).camera()
+    again = to_frame(shown, camera, shown.time_ns, captured.frame.name)
+    np.testing.assert_array_equal(again.image, captured.frame.image)
+    assert again.camera == captured.frame.camera
+    assert again.time_ns == captured.frame.time_ns
 
 
 async def cancel_when(
@@ -467,7 +493,7 @@ def test_cancelling_between_two_tries_does_not_wait_for_the_next() -> None:
 
     config = DepthaiConfig(type="depthai")
     source = DepthaiSource(
-        config, open_pipeline=no_device, delays_s=lambda: itertools.repeat(10 * GUARD_S)
+        config, open_pipeline=no_device, backoff=Backoff(20 * GUARD_S, 20 * GUARD_S)
     )
     asyncio.run(cancel_when(tried, source))
 
@@ -561,9 +587,7 @@ def test_a_device_that_is_not_there_is_looked_for_and_said_once(
         return open_camera(config)
 
     config = DepthaiConfig(type="depthai", device="no such camera")
-    source = DepthaiSource(
-        config, open_pipeline=open_counted, delays_s=lambda: itertools.repeat(0.0)
-    )
+    source = DepthaiSource(config, open_pipeline=open_counted, backoff=Backoff(0.0))
     asyncio.run(cancel_when(enough, source))
     said = [record.message for record in caplog.records if record.name.startswith("trigpointd")]
     assert len(said) == 1

@@ -296,11 +296,32 @@ def test_a_log_that_exists_is_one_line_and_exit_1(demo: Demo, tmp_path: Path, po
 
 def test_check_config_opens_what_is_named(demo: Demo, tmp_path: Path) -> None:
     config = write_config(tmp_path, demo.map, demo.recording)
-    assert run("trigpointd", "check-config", config).returncode == 0
+    done = run("trigpointd", "check-config", config)
+    assert done.returncode == 0
+    assert f"{demo.recording}: images on /camera/image, OPENCV 640 480 460 460" in done.stdout
     config.write_text(config.read_text().replace("map.tpmap", "nap.tpmap"))
     done = run("trigpointd", "check-config", config)
     assert done.returncode == 1
     assert "nap.tpmap" in done.stderr
+
+
+def test_a_camera_that_is_not_there_is_waited_for_but_fails_the_check(
+    demo: Demo, tmp_path: Path
+) -> None:
+    config = write_config(tmp_path, demo.map, demo.recording)
+    camera = 'device = "video-none"\ncamera = "PINHOLE 640 480 460 460 320 240"'
+    text = config.read_text().replace('"mcap"', '"v4l2"')
+    config.write_text(text.replace(f'path = "{demo.recording}"', camera))
+    done = run("trigpointd", "check-config", config)
+    assert done.returncode == 1
+    absent = f"trigpointd: camera {tmp_path}/video-none: it is not there: plug it in, or name "
+    assert done.stderr == absent + "another source.device\n"
+    with daemon(config) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith(absent)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+        assert absent not in process.stderr.read()
 
 
 def test_without_poselib_opencv_does_its_part(demo: Demo, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from trigpoint.frame import Reason, Statistics
 from trigpoint.options import LocalizerOptions
-from trigpointd.config import Config
+from trigpointd.config import Config, V4l2Config
 
 DOCS = Path(__file__).parents[2] / "docs"
 pytestmark = pytest.mark.skipif(not DOCS.is_dir(), reason="needs the checkout's docs/")
@@ -31,6 +31,12 @@ def test_the_example_has_every_other_setting_and_is_valid() -> None:
     assert set(tables) == set(Config.model_fields) - {"localizer"}
     for name in ("source", "camera", "model", "zenoh", "log"):
         assert set(tables[name]) == set(type(getattr(config, name)).model_fields)
+
+
+def test_the_example_of_a_camera_has_all_its_settings_and_is_valid() -> None:
+    text = (DOCS / "configuration.md").read_text()
+    source = tomllib.loads(text.split("```toml")[2].split("```")[0])["source"]
+    assert set(source) == set(type(V4l2Config.model_validate(source)).model_fields)
 
 
 def test_every_reason_and_count_is_explained() -> None:

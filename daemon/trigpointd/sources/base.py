@@ -53,7 +53,7 @@ class Captured:
     log_time_ns: int  # of arrival
     image: Message | None = None
     calibration: Message | None = None
-    num_missed: int = 0  # frames that a camera took and that never came, so far
+    num_missed: int = 0  # frames that the camera or its driver lost so far
 
 
 class Source(Protocol):

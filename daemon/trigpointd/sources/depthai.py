@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from typing import Any, TypeVar
@@ -14,11 +14,12 @@ import numpy as np
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError, SourceError
-from trigpoint.frame import Frame
+from trigpointd.backoff import Backoff
+from trigpointd.clock import WallClock
 from trigpointd.config import DepthaiConfig
+from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
 from trigpointd.messages.images import Calibration, Image, to_frame
-from trigpointd.sources.base import BadFrame, Captured
-from trigpointd.sources.live import retry_delays_s, wall_time_ns
+from trigpointd.sources.base import BadFrame, Captured, Message
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -43,7 +44,7 @@ class DepthaiSource:
     """One camera of an OAK device; where it is lost, it is looked for until it is back.
 
     Frames are stamped with the middle of their exposure, which DepthAI gives in the host's
-    monotonic clock, as `wall_time_ns` turns it into the system's time. Their intrinsics are those
+    monotonic clock, as `WallClock` turns it into the system's time. Their intrinsics are those
     that come with each of them, of the size and crop it has. DepthAI is called from one thread
     alone, except to close the queue that this thread waits for.
 
@@ -53,8 +54,8 @@ class DepthaiSource:
         Which camera, and how it takes pictures.
     open_pipeline : callable, optional
         Makes the pipeline, not yet started, and its queue of frames.
-    delays_s : callable, optional
-        Gives the waiting times before each try after a loss.
+    backoff : Backoff, optional
+        The delays between tries.
     """
 
     live = True
@@ -64,18 +65,34 @@ class DepthaiSource:
         config: DepthaiConfig,
         *,
         open_pipeline: Callable[[DepthaiConfig], tuple[Any, Any]] | None = None,
-        delays_s: Callable[[], Iterator[float]] = retry_delays_s,
+        backoff: Backoff | None = None,
     ) -> None:
         self._dai = _import_depthai()
         self._config = config
         self._open_pipeline = open_pipeline or open_camera
-        self._delays_s = delays_s
+        self._backoff = backoff or Backoff()
+        self._clock = WallClock()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="depthai")
         self._pipeline: Any = None
         self._queue: Any = None
+        self._calibration: Message | None = None
+        self._camera: Camera | None = None
         self._problem: str | None = None
         self._sequence: int | None = None
         self._num_missed = 0
+
+    def describe(self) -> str:
+        """Take a frame and say what it is."""
+        try:
+            self._start()
+            frame = self._next().frame
+        except _CameraLostError as error:
+            raise SourceError(str(error)) from error
+        finally:
+            self._stop()
+        if isinstance(frame, BadFrame):
+            raise SourceError(frame.detail)
+        return f"{self._config.socket} gives {frame.camera.width} x {frame.camera.height} px"
 
     async def frames(self) -> AsyncGenerator[Captured, None]:
         """Yield frames as they come; one that cannot be used is a `BadFrame`.
@@ -85,20 +102,19 @@ class DepthaiSource:
         SourceError
             Where no other try would help: there is no such socket, or no usable calibration.
         """
-        delays_s = self._delays_s()
         while True:
             try:
                 await self._in_thread(self._start)
                 while True:
                     captured = await self._in_thread(self._next)
                     self._report("")
-                    delays_s = self._delays_s()
+                    self._backoff.reset()
                     yield captured
             except _CameraLostError as error:
                 self._report(str(error))
             finally:
                 await self.close()
-            await asyncio.sleep(next(delays_s))
+            await asyncio.sleep(self._backoff.next_s())
 
     async def close(self) -> None:
         """Stop the camera, also while its thread waits for a frame."""
@@ -137,7 +153,7 @@ class DepthaiSource:
         if image is None:
             raise _CameraLostError(f"no frame from the camera in {timeout_s:g} s")
         self._count(image.getSequenceNum())
-        return Captured(self._convert(image), time.time_ns(), num_missed=self._num_missed)
+        return self._capture(image)
 
     def _count(self, sequence: int) -> None:
         if self._sequence is not None and sequence > self._sequence + 1:
@@ -146,24 +162,31 @@ class DepthaiSource:
             _log.debug("%d frames missed before frame %d", missed, sequence)
         self._sequence = sequence
 
-    def _convert(self, image: Any) -> Frame | BadFrame:
-        name = f"{self._config.socket}#{image.getSequenceNum()}"
+    def _capture(self, image: Any) -> Captured:
+        arrival_ns, sequence = time.time_ns(), image.getSequenceNum()
+        name = f"{self._config.socket}#{sequence}"
         middle = image.getTimestamp(self._dai.CameraExposureOffset.MIDDLE)
-        time_ns = wall_time_ns(middle // timedelta(microseconds=1) * 1000)
+        time_ns = self._clock.time_ns(middle // timedelta(microseconds=1) * 1000)
         camera = _camera(image.getTransformation())
+        if self._calibration is None or camera != self._camera:
+            self._camera = camera
+            self._calibration = calibration_message(camera, arrival_ns)
+        parsed = Image(
+            time_ns,
+            "camera",
+            image.getData().tobytes(),
+            _ENCODINGS.get(image.getType().name, image.getType().name),
+            image.getWidth(),
+            image.getHeight(),
+            image.getStride(),
+        )
         try:
-            parsed = Image(
-                time_ns,
-                name,
-                image.getData().tobytes(),
-                _ENCODINGS.get(image.getType().name, image.getType().name),
-                image.getWidth(),
-                image.getHeight(),
-                image.getStride(),
-            )
-            return to_frame(parsed, camera, time_ns, name)
+            frame = to_frame(parsed, camera, time_ns, name)
         except SourceError as error:
-            return BadFrame(time_ns, name, str(error))
+            bad = BadFrame(arrival_ns, name, str(error))
+            return Captured(bad, arrival_ns, num_missed=self._num_missed)
+        message = image_message(gray_image(parsed, frame), arrival_ns, sequence)
+        return Captured(frame, arrival_ns, message, self._calibration, self._num_missed)
 
     def _stop(self) -> None:
         pipeline, self._pipeline, self._queue = self._pipeline, None, None

@@ -76,6 +76,11 @@ class McapSource:
             self._recording.close()
             raise SourceError(f"recording {path}: {error}") from error
 
+    def describe(self) -> str:
+        """Say what it delivers."""
+        camera = self._camera(self._calibration).to_text()
+        return f"{self._recording.path}: images on {self._image_topic}, {camera}"
+
     async def frames(self) -> AsyncGenerator[Captured, None]:
         """Yield the frames in their recorded order; the next is decoded while one is in use."""
         loop = asyncio.get_running_loop()

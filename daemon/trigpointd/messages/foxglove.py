@@ -1,0 +1,82 @@
+"""Foxglove's messages of a camera that sends none, so that a log of it replays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.descriptor import Descriptor, FileDescriptor  # type: ignore[import-untyped]
+from google.protobuf.descriptor_pb2 import FileDescriptorSet  # type: ignore[import-untyped]
+
+from trigpoint.camera import Camera
+from trigpoint.frame import Frame
+from trigpointd.messages.images import Image
+from trigpointd.sources.base import Channel, Message
+
+_FRAME_ID = "camera"
+_DISTORTION = {"OPENCV_FISHEYE": "kannala_brandt", "FULL_OPENCV": "rational_polynomial"}
+
+
+def _channel(topic: str, schema: Descriptor) -> Channel:
+    files = FileDescriptorSet()
+    _add(files, schema.file)
+    return Channel(topic, "protobuf", schema.full_name, "protobuf", files.SerializeToString())
+
+
+def _add(files: FileDescriptorSet, file: FileDescriptor) -> None:
+    """Add a schema's file after those that it needs."""
+    for needed in file.dependencies:
+        _add(files, needed)
+    if file.name not in {known.name for known in files.file}:
+        file.CopyToProto(files.file.add())
+
+
+_CALIBRATION = _channel("/camera/calibration", CameraCalibration.DESCRIPTOR)
+_RAW = _channel("/camera/image", RawImage.DESCRIPTOR)
+_COMPRESSED = _channel("/camera/image", CompressedImage.DESCRIPTOR)
+
+
+def calibration_message(camera: Camera, log_time_ns: int) -> Message:
+    """Write a camera's intrinsics."""
+    model, distortion = "plumb_bob", [*camera.distortion, 0.0]  # with k3
+    if camera.model in _DISTORTION:
+        model, distortion = _DISTORTION[camera.model], list(camera.distortion)
+    message = CameraCalibration(
+        frame_id=_FRAME_ID,
+        width=camera.width,
+        height=camera.height,
+        distortion_model=model,
+        D=distortion,
+        K=camera.K.ravel(),
+        R=[1, 0, 0, 0, 1, 0, 0, 0, 1],
+        P=[*camera.K[0], 0, *camera.K[1], 0, *camera.K[2], 0],
+    )
+    message.timestamp.FromNanoseconds(log_time_ns)
+    return Message(_CALIBRATION, message.SerializeToString(), log_time_ns, log_time_ns)
+
+
+def image_message(image: Image, log_time_ns: int, sequence: int) -> Message:
+    """Write an image: a JPEG file where it has no encoding, else its rows."""
+    channel, message = _COMPRESSED, CompressedImage(format="jpeg", data=image.data)
+    if image.encoding is not None:
+        channel, message = (
+            _RAW,
+            RawImage(
+                encoding=image.encoding,
+                width=image.width,
+                height=image.height,
+                step=image.step,
+                data=image.data,
+            ),
+        )
+    message.frame_id = _FRAME_ID
+    message.timestamp.FromNanoseconds(image.time_ns)
+    return Message(channel, message.SerializeToString(), log_time_ns, log_time_ns, sequence)
+
+
+def gray_image(image: Image, frame: Frame) -> Image:
+    """Replace an image's pixels by the gray levels that a frame has of it: all a replay needs."""
+    width = frame.image.shape[1]
+    return replace(image, data=frame.image.tobytes(), encoding="mono8", step=width)
