@@ -2,7 +2,8 @@
 
 A file is a row of records, some of them chunks of messages with the checksum of what is in them.
 What a checksum vouches for is kept: where the row is broken, the next chunk whose checksum is right
-is looked for. A file without chunks has no checksums and is read up to the first broken record.
+is looked for. Chunks that some programs write without one are taken while the row holds.
+A file without chunks is read up to the first broken record.
 """
 
 from __future__ import annotations
