@@ -13,13 +13,23 @@ from typing import Annotated
 import numpy as np
 import threadpoolctl
 import typer
+from pydantic import ValidationError
 
 from trigpoint.errors import TrigpointError
 from trigpoint.models.features import find_model
 from trigpoint.output import check_output, open_text
 from trigpoint.poses import format_pose
-from trigpointd.config import Config, LogConfig, McapConfig, ModelConfig, ZenohConfig, load_config
+from trigpointd.config import (
+    Config,
+    LogConfig,
+    McapConfig,
+    ModelConfig,
+    ZenohConfig,
+    explain,
+    load_config,
+)
 from trigpointd.service import open_pipeline, open_source, run
+from trigpointd.sinks.log_files import LogFiles
 from trigpointd.sinks.zenoh import make_settings
 from trigpointd.watch import Received, subscribe
 
@@ -60,6 +70,8 @@ def check_config(config: Annotated[Path, typer.Argument(help="Settings, a TOML f
     settings = load_config(config)
     if settings.zenoh is not None:
         make_settings(settings.zenoh)
+    if settings.log is not None:
+        check_output(LogFiles(settings.log.path).unnumbered())
     with open_pipeline(settings):
         source = open_source(settings)
         print(source.describe())
@@ -76,6 +88,11 @@ def replay(
         Path | None, typer.Option(help="Write `time_ns qw qx qy qz tx ty tz`, cam_from_world.")
     ] = None,
     topic: Annotated[str | None, typer.Option(help="The images' topic.")] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Of the recorded pace; as fast as it goes by default.")
+    ] = None,
+    start: Annotated[float, typer.Option(help="Seconds since the first image.")] = 0.0,
+    end: Annotated[float | None, typer.Option(help="The same; the last by default.")] = None,
     model: Annotated[str, typer.Option(help="tiny, base, large, or a file (.onnx).")] = "base",
     retrieval: Annotated[
         Path | None, typer.Option(help="A retrieval network, where the other needs one.")
@@ -84,10 +101,12 @@ def replay(
         Path | None, typer.Option(help="A matching network; mutual nearest neighbours by default.")
     ] = None,
 ) -> None:
-    """Localize every frame of a recording, as fast as it goes."""
+    """Localize every frame of a recording."""
     config = Config(
         map=map_,
-        source=McapConfig(type="mcap", path=recording, image_topic=topic),
+        source=McapConfig(
+            type="mcap", path=recording, image_topic=topic, rate=rate, start_s=start, end_s=end
+        ),
         model=ModelConfig(network=find_model(model), retrieval=retrieval, matcher=matcher),
         log=None if log is None else LogConfig(path=log),
     )
@@ -161,6 +180,8 @@ def main() -> None:
         app()
     except TrigpointError as error:
         sys.exit(f"trigpointd: {error}")
+    except ValidationError as error:  # of an option of `replay`
+        sys.exit(f"trigpointd: {explain(error)}")
     except OSError as error:  # a folder that cannot be entered, a name too long, a full disk
         sys.exit(f"trigpointd: {error.filename or 'output'}: {error.strerror}")
     except KeyboardInterrupt:

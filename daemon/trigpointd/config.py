@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
@@ -16,6 +17,7 @@ from pydantic import (
     Field,
     PlainValidator,
     ValidationError,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -44,6 +46,9 @@ class McapConfig(Section):
     path: Path
     image_topic: str | None = None  # needed where the recording has several
     rate: Annotated[float, Field(gt=0)] | None = None  # of the recorded pace; without: at once
+    start_s: Annotated[float, Field(ge=0)] = 0.0  # since the first image
+    end_s: Annotated[float, Field(gt=0)] | None = None
+    loop: bool = False  # begin again at the end; times go on
 
 
 def _parse_camera(text: object) -> Camera:
@@ -146,9 +151,34 @@ class ZenohConfig(Section):
 class LogConfig(Section):
     """The MCAP log."""
 
-    path: Path  # strftime's %Y, %m, %d, %H, %M, %S stand for the time of the start
+    path: Path  # in the file's name %Y, %m, %d, %H, %M, %S stand for the time of its start
     frames: bool = True  # input images too, so that the log can be replayed
     overwrite: bool = False
+    max_part_mb: Annotated[float, Field(ge=1)] | None = None  # then comes another part; off
+    max_part_s: Annotated[float, Field(ge=1)] | None = None  # the same
+    min_free_mb: Annotated[float, Field(ge=0)] = 0.0  # on the disk; old logs are deleted for it
+    flush_s: Annotated[float, Field(gt=0)] = 1.0  # what a loss of power costs
+
+    @field_validator("path")
+    @classmethod
+    def _named_by_time(cls, path: Path) -> Path:
+        if any("%" in part for part in path.parts[:-1]):
+            raise ValueError("the time may stand in the file's name, not in a folder's")
+        if re.search("%(?![YmdHMS])", path.name):
+            raise ValueError("the file's name takes %Y, %m, %d, %H, %M and %S")
+        return path
+
+    @field_validator("max_part_mb", "max_part_s")
+    @classmethod
+    def _not_overwritten(cls, limit: float | None, info: ValidationInfo) -> float | None:
+        if limit is not None and info.data.get("overwrite"):
+            raise ValueError("parts have numbers of their own; leave out overwrite")
+        return limit
+
+    @property
+    def rotates(self) -> bool:
+        """Whether the log is written in parts."""
+        return self.max_part_mb is not None or self.max_part_s is not None
 
 
 class Config(Section):
@@ -177,7 +207,7 @@ def load_config(path: Path) -> Config:
         # As JSON, of whose types TOML's are, so that a strict check still takes text for a path.
         config = Config.model_validate_json(json.dumps(tables, default=str), strict=True)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {_explain(error)}") from error
+        raise ConfigError(f"{path}: {explain(error)}") from error
     except ConfigError as error:  # from LocalizerOptions
         raise ConfigError(f"{path}: localizer: {error}") from error
     return _resolve(config, path.parent)
@@ -196,7 +226,7 @@ def _resolve(section: S, folder: Path) -> S:
     return section.model_copy(update=changes)
 
 
-def _explain(error: ValidationError) -> str:
+def explain(error: ValidationError) -> str:
     """Put one thing that is wrong in one line; for an unknown key, name the nearest one."""
     unknown = ("extra_forbidden", "unexpected_keyword_argument")
     # A mistyped key is both unknown and missing: the former says more.

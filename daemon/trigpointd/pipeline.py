@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from trigpoint.database.reader import MapReader
@@ -56,8 +57,13 @@ class Pipeline:
         self._body_from_camera = body_from_camera
         self._map_frame = map_frame
 
-    def process(self, captured: Captured, num_dropped: int) -> Output:
-        """Localize one frame; `num_dropped` is how many the slot has dropped so far."""
+    def process(
+        self, captured: Captured, num_dropped: int, log: Mapping[str, object] | None = None
+    ) -> Output:
+        """Localize one frame.
+
+        `num_dropped` is how many the slot has dropped so far, `log` what the log reports.
+        """
         start_s = time.perf_counter()
         frame = captured.frame
         self._refresh_map()
@@ -76,6 +82,7 @@ class Pipeline:
             "num_dropped": num_dropped,
             "num_missed": captured.num_missed,
             "map_generation": self._reader.generation,
+            **(log or {}),
         }
         return Output(captured, result, pose, json.dumps(status).encode())
 

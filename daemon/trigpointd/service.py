@@ -25,8 +25,9 @@ from trigpointd.latest import Latest
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.sd_notify import notify
 from trigpointd.sinks.base import Sink
-from trigpointd.sinks.mcap import McapLog
 from trigpointd.sinks.poses import PoseFile
+from trigpointd.sinks.recorder import Recorder
+from trigpointd.sinks.rolling_log import RollingLog
 from trigpointd.sinks.zenoh import ZenohSink
 from trigpointd.sources.base import Captured, Source
 from trigpointd.sources.depthai import DepthaiSource
@@ -57,13 +58,22 @@ def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink
     if isinstance(config.source, McapConfig):
         inputs.append(config.source.path)
     check_output(poses, *inputs)
-    if config.log is not None:
-        check_output(config.log.path, *inputs)
     with ExitStack() as stack:
         pipeline = stack.enter_context(open_pipeline(config))
         source = open_source(config)
         sinks = list(extra_sinks)
         first = None
+        if config.log is not None:
+            recording = not source.live
+            log = RollingLog(
+                config.log,
+                config.base_key,
+                inputs=inputs,
+                required=recording,
+                about={"settings": config.model_dump_json()},
+            )
+            sinks.append(Recorder(log, lossless=recording))
+            stack.callback(sinks[-1].close)
         if config.zenoh is not None:
             zenoh = ZenohSink(config.zenoh, config.base_key)
             stack.callback(zenoh.close)
@@ -72,9 +82,6 @@ def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink
             first = partial(zenoh.wait_for_subscriber, config.zenoh.wait_for_subscriber_s)
         if poses is not None:
             sinks.append(PoseFile(poses))
-            stack.callback(sinks[-1].close)
-        if config.log is not None:
-            sinks.append(McapLog.from_config(config.log, config.base_key))
             stack.callback(sinks[-1].close)
         return asyncio.run(_run_until_signal(source, pipeline, sinks, first))
 
@@ -100,7 +107,14 @@ def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
     """Open the recording; a camera is opened when frames are asked for."""
     source = config.source
     if isinstance(source, McapConfig):
-        return McapSource(source.path, image_topic=source.image_topic, rate=source.rate)
+        return McapSource(
+            source.path,
+            image_topic=source.image_topic,
+            rate=source.rate,
+            start_s=source.start_s,
+            end_s=source.end_s,
+            loop=source.loop,
+        )
     return V4l2Source(source) if isinstance(source, V4l2Config) else DepthaiSource(source)
 
 
@@ -175,10 +189,16 @@ async def _localize(
     slot: Latest[Captured], pipeline: Pipeline, sinks: list[Sink], totals: Totals
 ) -> None:
     while (captured := await slot.get()) is not None:
-        output = await asyncio.to_thread(pipeline.process, captured, slot.num_dropped)
+        output = await asyncio.to_thread(
+            pipeline.process, captured, slot.num_dropped, _log_report(sinks)
+        )
         _publish(sinks, output)
         totals.outcomes[output.outcome] += 1
         totals.num_dropped = slot.num_dropped
+
+
+def _log_report(sinks: list[Sink]) -> dict[str, object]:
+    return next((sink.report() for sink in sinks if isinstance(sink, Recorder)), {})
 
 
 def _publish(sinks: list[Sink], output: Output) -> None:

@@ -40,6 +40,7 @@ from trigpoint_db.latency import print_latency, read_stage_times, summarize_late
 from trigpoint_db.localize import localize_images
 from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
 from trigpoint_db.recording import FORMATS, RecordedImage, write_recording
+from trigpoint_db.recover import recover
 
 T = TypeVar("T")
 app = typer.Typer(
@@ -309,6 +310,31 @@ def _image_names(folder: Path) -> list[str]:
     if not names:
         raise ConfigError(f"{folder} holds no images ({', '.join(FORMATS)})")
     return names
+
+
+@app.command("recover")
+def recover_command(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP log or recording.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="The whole file; LOG.recovered.mcap by default."),
+    ] = None,
+    in_place: Annotated[
+        bool, typer.Option("--in-place", help="Put the whole file in the place of LOG.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Save what is whole of a log that a crash or a loss of power left unfinished, or damaged."""
+    if in_place and out is not None:
+        raise ConfigError("give either -o or --in-place")
+    out = log if in_place else out or log.with_suffix(f".recovered{log.suffix}")
+    recovered = recover(log, out, in_place=in_place)
+    if as_json:
+        print(json.dumps({"log": str(log), "recovered": str(out)} | asdict(recovered)))
+    else:
+        print(f"{out}: {recovered}")
+        for topic, count in sorted(recovered.topics.items()):
+            print(f"  {count:8d}  {topic}")
 
 
 @app.command()

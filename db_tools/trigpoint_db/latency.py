@@ -92,7 +92,9 @@ def _read_statuses(log: Path) -> Iterator[tuple[str, bytes]]:
             except _DAMAGE as error:
                 if whole:
                     detail = str(error) or type(error).__name__
-                    raise ConfigError(f"{log} is damaged ({detail}); try `mcap recover`") from error
+                    raise ConfigError(
+                        f"{log} is damaged ({detail}); try `trigpoint-db recover`"
+                    ) from error
     except OSError as error:
         raise ConfigError(f"cannot read {log}: {error.strerror}") from error
 

@@ -1,6 +1,7 @@
 """Of a live source the newest frame wins, whatever the localizer takes."""
 
 import asyncio
+import contextlib
 from collections.abc import AsyncGenerator
 from pathlib import Path
 
@@ -14,9 +15,14 @@ from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.rigid import Rigid3
 from trigpoint_db.demo import CAMERA
+from trigpointd.config import LogConfig
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.service import Totals, serve
+from trigpointd.sinks.base import Sink
+from trigpointd.sinks.recorder import Recorder
+from trigpointd.sinks.rolling_log import RollingLog
 from trigpointd.sources.base import Captured
+from trigpointd.sources.mcap import McapSource
 
 
 class Burst:
@@ -56,7 +62,7 @@ class Collector:
 
 
 def serve_burst(
-    folder: Path, model: FeatureModel, source: Burst, *sinks: Collector
+    folder: Path, model: FeatureModel, source: Burst, *sinks: Sink
 ) -> Totals | Exception:
     with MapWriter.create(folder / "m.tpmap", model.identity):
         pass
@@ -94,3 +100,22 @@ def test_a_sink_that_fails_does_not_stop_the_others(tmp_path: Path, model: Featu
     failing, sink = Collector(fails=True), Collector()
     assert isinstance(serve_burst(tmp_path, model, Burst(3), failing, sink), Totals)
     assert sink.times_ns[-1] == 2
+
+
+def test_frames_of_a_camera_are_logged_and_replay(tmp_path: Path, model: FeatureModel) -> None:
+    recorder = Recorder(RollingLog(LogConfig(path=tmp_path / "log.mcap"), "base"))
+    sink = Collector()
+    assert isinstance(serve_burst(tmp_path, model, Burst(3), recorder, sink), Totals)
+    recorder.close()
+
+    async def replay() -> list[Captured]:
+        source = McapSource(tmp_path / "log.mcap")
+        async with contextlib.aclosing(source.frames()) as frames:
+            captured = [c async for c in frames]
+        await source.close()
+        return captured
+
+    frames = [captured.frame for captured in asyncio.run(replay())]
+    # A time of 0 is none in a message: the time of arrival stands in for it, here the same.
+    assert [frame.time_ns for frame in frames] == sink.times_ns
+    assert all(isinstance(frame, Frame) and frame.camera == CAMERA for frame in frames)

@@ -15,14 +15,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
-from mcap.records import Message as Record
-from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
 from mcap_ros2.decoder import DecoderFactory as RosDecoders
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from tests.daemon.logs import numbered, numbers_in, numbers_in_unfinished
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError, SourceError
 from trigpoint.frame import Failed, Frame
@@ -182,7 +180,7 @@ def test_a_file_that_exists_is_replaced_only_on_request(tmp_path: Path) -> None:
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"missing/log\.mcap: No such file"):
+    with pytest.raises(SourceError, match=r"missing/log\.mcap: No such file"):
         McapLog(tmp_path / "missing" / "log.mcap", "base")
 
 
@@ -195,33 +193,20 @@ def _small_disk() -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-def publish_statuses(log: McapLog, count: int, noise_bytes: int) -> None:
-    """Write statuses with their number in them."""
+def publish_all(log: McapLog, count: int) -> None:
     for i in range(count):
-        noise = np.random.default_rng(i).bytes(noise_bytes).hex()
-        status = json.dumps({"i": i, "noise": noise}).encode()
-        log.publish(output(Captured(BadFrame(i, "", ""), i), status))
-
-
-def statuses_in_cut_off(path: Path) -> list[int]:
-    """Read the statuses before the place where the file breaks off, with mcap alone."""
-    found = []
-    with path.open("rb") as stream, contextlib.suppress(EndOfFile):
-        for record in StreamReader(stream).records:
-            if isinstance(record, Record):
-                found.append(json.loads(record.data)["i"])  # noqa: PERF401
-    return found
+        log.publish(numbered(i, noise_bytes=50_000))
 
 
 @pytest.mark.usefixtures("_small_disk")
 def test_a_full_disk_ends_the_log_and_leaves_what_was_written(tmp_path: Path) -> None:
     log = McapLog(tmp_path / "log.mcap", "base")
     with pytest.raises(SourceError, match=r"log\.mcap: File too large"):
-        publish_statuses(log, 1000, noise_bytes=50_000)
+        publish_all(log, 1000)
     with pytest.raises(SourceError, match="closed"):
-        publish_statuses(log, 1, noise_bytes=0)
+        log.publish(numbered(0))
     log.close()  # harmless
-    found = statuses_in_cut_off(tmp_path / "log.mcap")
+    found = numbers_in_unfinished(tmp_path / "log.mcap")
     assert found == list(range(len(found)))
     assert 6 <= len(found) < 10  # of 100 kB, three to a chunk
 
@@ -259,16 +244,69 @@ def test_a_killed_process_loses_only_the_chunk_in_progress(
         assert child.stdout is not None
         assert child.stdout.readline() == "written\n"
         child.kill()
-    found = statuses_in_cut_off(path)
+    found = numbers_in_unfinished(path)
     assert found == list(range(len(found)))
     assert len(found) >= at_least
 
 
-def test_a_chunk_is_closed_when_its_time_is_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("trigpointd.sinks.mcap._FLUSH_S", 0.0)
+def test_what_is_flushed_can_be_read(tmp_path: Path) -> None:
     log = McapLog(tmp_path / "log.mcap", "base")
-    publish_statuses(log, 3, noise_bytes=0)
-    assert statuses_in_cut_off(tmp_path / "log.mcap") == [0, 1, 2]
+    log.publish(numbered(0))
+    assert not log.holds_messages
+    assert numbers_in_unfinished(tmp_path / "log.mcap") == []
+    log.flush()
+    assert log.holds_messages
+    assert numbers_in_unfinished(tmp_path / "log.mcap") == [0]
     log.close()
+
+
+def test_a_log_has_one_writer(tmp_path: Path) -> None:
+    log = McapLog(tmp_path / "log.mcap", "base")
+    log.publish(numbered(7))
+    with pytest.raises(ConfigError, match=r"another daemon is writing the log .*log\.mcap"):
+        McapLog(tmp_path / "log.mcap", "base", overwrite=True)
+    log.close()
+    assert numbers_in(tmp_path / "log.mcap") == [7]
+    McapLog(tmp_path / "log.mcap", "base", overwrite=True).close()
+    assert numbers_in(tmp_path / "log.mcap") == []
+
+
+def test_a_log_says_what_it_is_about(tmp_path: Path) -> None:
+    McapLog(tmp_path / "log.mcap", "base", about={"settings": "{}"}).close()
+    with (tmp_path / "log.mcap").open("rb") as stream:
+        [metadata] = make_reader(stream).iter_metadata()
+    assert (metadata.name, metadata.metadata) == ("trigpoint", {"settings": "{}"})
+
+
+CAMERAS = [
+    Camera("SIMPLE_PINHOLE", 40, 30, (35, 19.5, 14.5)),
+    Camera("SIMPLE_RADIAL", 40, 30, (35, 19.5, 14.5, -0.1)),
+    Camera("OPENCV", 40, 30, (35, 36, 19.5, 14.5, -0.1, 0.02, 0.003, -0.004)),
+    WIDE,
+]
+
+
+def test_frames_that_came_without_messages_replay_to_the_bit(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    original = [
+        Captured(Frame(rng.integers(0, 256, (30, 40), dtype=np.uint8), camera, START_NS + i), i + 1)
+        for i, camera in enumerate(c for c in CAMERAS for _ in range(2))
+    ]
+    replayed = play(write_log(tmp_path / "log.mcap", original))
+    pixels = rng.uniform([0, 0], [39, 29], (100, 2))
+    for a, b in zip(replayed, original, strict=True):
+        assert isinstance(a.frame, Frame)
+        assert isinstance(b.frame, Frame)
+        assert np.array_equal(a.frame.image, b.frame.image)
+        assert (a.frame.time_ns, a.log_time_ns) == (b.frame.time_ns, b.log_time_ns)
+        assert np.array_equal(a.frame.camera.normalize(pixels), b.frame.camera.normalize(pixels))
+    with (tmp_path / "log.mcap").open("rb") as stream:
+        decoded = make_reader(stream, decoder_factories=[ProtobufDecoders()])
+        calibrations = list(decoded.iter_decoded_messages(["/camera/calibration"]))
+    assert len(calibrations) == len(CAMERAS)
+
+
+def test_a_log_of_frames_replays_like_a_log_of_messages(tmp_path: Path, recording: Path) -> None:
+    original = play(recording)
+    bare = [Captured(c.frame, c.log_time_ns) for c in original]
+    assert_same_frames(play(write_log(tmp_path / "log.mcap", bare)), original)

@@ -516,7 +516,7 @@ def test_a_damaged_chunk_ends_the_replay_with_an_error(
             await source.close()
 
     seen: list[int | None] = []
-    with pytest.raises(SourceError, match=r"r\.mcap: the file is damaged .*mcap recover"):
+    with pytest.raises(SourceError, match=r"r\.mcap: the file is damaged .*trigpoint-db recover"):
         asyncio.run(play_into(seen))
     assert seen == list(range(second.message_start_time - START_NS))
     assert seen
@@ -587,3 +587,117 @@ def test_a_replay_that_waits_for_the_next_frame_can_be_cancelled(tmp_path: Path)
         return task.cancelled()
 
     assert asyncio.run(cancel_in_the_pause())
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s", "expected"),
+    [
+        (0.0, None, range(10)),
+        (0.3, None, range(3, 10)),
+        (0.25, None, range(3, 10)),
+        (0.0, 0.3, range(3)),
+        (0.3, 0.5, range(3, 5)),
+        (0.9, 1e300, range(9, 10)),
+    ],
+)
+def test_a_part_of_a_recording_plays(
+    recording: Path, start_s: float, end_s: float | None, expected: range
+) -> None:
+    source = McapSource(recording, start_s=start_s, end_s=end_s)
+    captured = asyncio.run(play(source))
+    assert [shown(c.frame) for c in captured] == list(expected)
+    assert captured[0].log_time_ns == START_NS + expected[0] * 10**8
+
+
+def test_a_part_begins_with_the_calibration_then_in_force(tmp_path: Path) -> None:
+    path = write_foxglove(
+        tmp_path / "r.mcap",
+        [
+            ("/camera/calibration", calibration(fx=35)),
+            ("/camera/image", image(0)),
+            ("/camera/calibration", calibration(fx=40)),
+            ("/camera/image", image(1)),
+            ("/camera/image", image(2)),
+            ("/camera/calibration", calibration(fx=45)),
+            ("/camera/image", image(3)),
+        ],
+    )
+    captured = asyncio.run(play(McapSource(path, start_s=3)))
+    frames = [c.frame for c in captured if isinstance(c.frame, Frame)]
+    assert [shown(frame) for frame in frames] == [2, 3]
+    assert [frame.camera.focals_px[0] for frame in frames] == [40, 45]
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s", "complaint"),
+    [
+        (1.0, None, "no images from 1 s; the last is at 0.900 s"),
+        (0.91, 5.0, "no images from 0.91 s to 5 s; the last is at 0.900 s"),
+        (0.31, 0.39, "no images from 0.31 s to 0.39 s"),
+    ],
+)
+def test_a_part_without_images_is_an_error(
+    recording: Path, start_s: float, end_s: float | None, complaint: str
+) -> None:
+    with pytest.raises(SourceError, match=rf"recording\.mcap: {complaint}"):
+        McapSource(recording, start_s=start_s, end_s=end_s)
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s"),
+    [
+        (-1.0, None),
+        (2.0, 2.0),
+        (2.0, 1.0),
+        (float("nan"), None),
+        (0.0, float("nan")),
+        (1e300, None),
+    ],
+)
+def test_a_part_must_begin_before_it_ends(
+    recording: Path, start_s: float, end_s: float | None
+) -> None:
+    with pytest.raises(ConfigError, match="give a start of 0 or more and an end after it"):
+        McapSource(recording, start_s=start_s, end_s=end_s)
+
+
+def play_some(source: McapSource, count: int) -> list[Captured]:
+    """Take the first frames of an endless source."""
+
+    async def take() -> list[Captured]:
+        async with contextlib.aclosing(source.frames()) as frames:
+            taken = [await anext(frames) for _ in range(count)]
+        await source.close()
+        return taken
+
+    return asyncio.run(take())
+
+
+def test_a_loop_begins_again_and_its_times_go_on(recording: Path) -> None:
+    captured = play_some(McapSource(recording, start_s=0.7, loop=True), 8)
+    assert [shown(c.frame) for c in captured] == [7, 8, 9, 7, 8, 9, 7, 8]
+    expected = [START_NS + (7 + i) * 10**8 for i in range(8)]  # at the recorded pace
+    assert [c.frame.time_ns for c in captured] == expected
+    assert [c.log_time_ns for c in captured] == expected
+    assert len({c.frame.name for c in captured}) == 8
+    assert all(c.image is None and c.calibration is None for c in captured)
+
+
+def test_times_rise_in_a_loop_though_images_arrive_late(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with path.open("wb") as stream, Writer(stream) as writer:
+        writer.write_message("/camera/calibration", calibration(), START_NS, START_NS)
+        for i, delay_ns in enumerate((10**9, 0, 0)):  # the first waited longest
+            message = image(i)
+            message.timestamp.FromNanoseconds(START_NS + i * 10**9)
+            writer.write_message("/camera/image", message, START_NS + i * 10**9 + delay_ns)
+    captured = play_some(McapSource(path, loop=True), 9)
+    for times_ns in ([c.frame.time_ns for c in captured], [c.log_time_ns for c in captured]):
+        assert times_ns == sorted(times_ns)
+    assert len({c.frame.time_ns for c in captured}) == 9
+
+
+def test_a_single_frame_loops(tmp_path: Path) -> None:
+    path = write_foxglove(tmp_path / "r.mcap", [("/c/info", calibration()), ("/c/image", image(0))])
+    times_ns = [c.frame.time_ns for c in play_some(McapSource(path, loop=True), 3)]
+    assert np.diff(times_ns).tolist() == [10**8, 10**8]

@@ -2,6 +2,8 @@
 
 import contextlib
 import json
+import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -219,7 +221,7 @@ def test_if_nobody_subscribes_it_goes_on(demo: Demo, tmp_path: Path, port: int) 
     assert "nobody has subscribed to the poses in 0.2 s" in done.stderr
 
 
-def test_after_kill_9_all_but_the_last_chunk_of_the_log_plays(demo: Demo, tmp_path: Path) -> None:
+def test_after_kill_9_the_log_is_recovered_and_replays(demo: Demo, tmp_path: Path) -> None:
     config = write_config(tmp_path, demo.map, demo.recording, more="rate = 4.0")
     log = tmp_path / "log.mcap"
     with daemon(config) as process:
@@ -230,12 +232,88 @@ def test_after_kill_9_all_but_the_last_chunk_of_the_log_plays(demo: Demo, tmp_pa
         for record in StreamReader(stream).records:
             logged += isinstance(record, Message) and record.channel_id == 2
     assert logged >= 5  # of some 80 kB each
-    poses = tmp_path / "recovered.txt"
-    done = run("trigpointd", "replay", log, "--map", demo.map, "--poses", poses)
+    whole = tmp_path / "whole.mcap"
+    done = run("trigpoint_db", "recover", log, "-o", whole)
     assert done.returncode == 0, done.stderr
-    assert len(read_poses(poses)) == logged
+    assert re.search(rf" {logged} +/camera/image\n", done.stdout)
+    poses = {}
+    for recording in (log, whole, demo.recording):
+        out = tmp_path / f"{recording.stem}.txt"
+        done = run("trigpointd", "replay", recording, "--map", demo.map, "--poses", out)
+        assert done.returncode == 0, done.stderr
+        assert ("`trigpoint-db recover`" in done.stderr) == (recording == log)
+        poses[recording] = out.read_text()
+    assert len(read_poses(tmp_path / "whole.txt")) == logged
+    assert poses[log] == poses[whole]
+    assert poses[demo.recording].startswith(poses[whole])
     done = run("trigpoint_db", "verify", demo.map)
     assert done.returncode == 0, done.stdout
+
+
+def test_each_part_of_a_log_replays_the_same_poses(demo: Demo, tmp_path: Path) -> None:
+    config = write_config(tmp_path, demo.map, demo.recording)
+    config.write_text(config.read_text().replace('"log.mcap"', '"log.mcap"\nmax_part_mb = 1'))
+    done = run("trigpointd", "run", "--config", config)
+    assert done.returncode == 0, done.stderr
+    parts = sorted(tmp_path.glob("log.*.mcap"))
+    assert len(parts) >= 2
+    poses = {}
+    for recording in (*parts, demo.recording):
+        out = tmp_path / "poses.txt"
+        done = run("trigpointd", "replay", recording, "--map", demo.map, "--poses", out)
+        assert done.returncode == 0, done.stderr
+        poses[recording] = out.read_text()
+    whole = poses.pop(demo.recording)
+    assert "".join(poses.values()) == whole
+    with parts[-1].open("rb") as stream:
+        reader = make_reader(stream)
+        [metadata] = reader.iter_metadata()
+        statuses = [
+            json.loads(m.data) for _, _, m in reader.iter_messages(["trigpoint/test/status"])
+        ]
+    settings = json.loads(metadata.metadata["settings"])
+    assert settings["map"] == str(demo.map)
+    assert all((s["num_unlogged"], s["log_problem"]) == (0, "") for s in statuses)
+
+
+def test_a_part_of_a_recording_is_replayed(demo: Demo, tmp_path: Path) -> None:
+    arguments = ("replay", demo.recording, "--map", demo.map)
+    done = run("trigpointd", *arguments, "--start", "0.5", "--end", "0.8", "--rate", "5")
+    assert done.returncode == 0, done.stderr
+    assert "3 LOCALIZED" in done.stdout
+    for wrong in (
+        ("--start", "2"), ("--start", "-1"), ("--end", "nan"), ("--rate", "0"),
+        ("--log", tmp_path / "%s.mcap"),
+    ):  # fmt: skip
+        done = run("trigpointd", *arguments, *wrong)
+        assert done.returncode == 1
+        assert done.stderr.startswith("trigpointd: ")
+        assert done.stderr.count("\n") == 1
+
+
+def test_a_log_folder_that_vanishes_does_not_stop_the_daemon(demo: Demo, tmp_path: Path) -> None:
+    config = write_config(tmp_path, demo.map, demo.recording, more="rate = 8.0\nloop = true")
+    folder = tmp_path / "stick"
+    folder.mkdir()
+    config.write_text(config.read_text().replace('"log.mcap"', '"stick/log.mcap"\nflush_s = 0.1'))
+    with daemon(config) as process:
+        assert process.stderr is not None
+        wait_until_larger(folder / "log.mcap", 200_000)
+        shutil.rmtree(folder)
+        assert "recording pauses" in process.stderr.readline()
+        folder.mkdir()
+        assert "recording goes on in" in process.stderr.readline()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+    with (folder / "log.000001.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        statuses = [
+            json.loads(m.data) for _, _, m in reader.iter_messages(["trigpoint/test/status"])
+        ]
+    assert "was deleted" in statuses[0]["log_problem"]
+    assert statuses[0]["num_unlogged"] > 0
+    times_ns = [status["time_ns"] for status in statuses]
+    assert times_ns == sorted(times_ns)
 
 
 def test_a_corrupt_image_in_a_recording_does_not_stop_the_stream(
@@ -299,10 +377,12 @@ def test_check_config_opens_what_is_named(demo: Demo, tmp_path: Path) -> None:
     done = run("trigpointd", "check-config", config)
     assert done.returncode == 0
     assert f"{demo.recording}: images on /camera/image, OPENCV 640 480 460 460" in done.stdout
-    config.write_text(config.read_text().replace("map.tpmap", "nap.tpmap"))
-    done = run("trigpointd", "check-config", config)
-    assert done.returncode == 1
-    assert "nap.tpmap" in done.stderr
+    good = config.read_text()
+    for right, wrong in (("map.tpmap", "nap.tpmap"), ("log.mcap", "lag/log.mcap")):
+        config.write_text(good.replace(right, wrong))
+        done = run("trigpointd", "check-config", config)
+        assert done.returncode == 1
+        assert wrong.partition("/")[0] in done.stderr
 
 
 def test_a_camera_that_is_not_there_is_waited_for_but_fails_the_check(

@@ -94,7 +94,7 @@ def test_damage_in_a_whole_log_is_an_error(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.mcap", FIRST, LOST, compression=CompressionType.NONE)
     data = log.read_bytes()
     log.write_bytes(data.replace(b"LOST", b"lost", 1))
-    with pytest.raises(ConfigError, match=r"log\.mcap is damaged \(crc.*mcap recover"):
+    with pytest.raises(ConfigError, match=r"log\.mcap is damaged \(crc.*trigpoint-db recover"):
         read_stage_times(log)
 
 

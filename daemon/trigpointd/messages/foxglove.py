@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Any
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from google.protobuf.descriptor import Descriptor, FileDescriptor  # type: ignore[import-untyped]
-from google.protobuf.descriptor_pb2 import FileDescriptorSet  # type: ignore[import-untyped]
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from trigpoint.camera import Camera
 from trigpoint.frame import Frame
@@ -19,23 +18,14 @@ _FRAME_ID = "camera"
 _DISTORTION = {"OPENCV_FISHEYE": "kannala_brandt", "FULL_OPENCV": "rational_polynomial"}
 
 
-def _channel(topic: str, schema: Descriptor) -> Channel:
-    files = FileDescriptorSet()
-    _add(files, schema.file)
-    return Channel(topic, "protobuf", schema.full_name, "protobuf", files.SerializeToString())
+def _channel(topic: str, kind: Any) -> Channel:
+    schema = build_file_descriptor_set(kind).SerializeToString()
+    return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", schema)
 
 
-def _add(files: FileDescriptorSet, file: FileDescriptor) -> None:
-    """Add a schema's file after those that it needs."""
-    for needed in file.dependencies:
-        _add(files, needed)
-    if file.name not in {known.name for known in files.file}:
-        file.CopyToProto(files.file.add())
-
-
-_CALIBRATION = _channel("/camera/calibration", CameraCalibration.DESCRIPTOR)
-_RAW = _channel("/camera/image", RawImage.DESCRIPTOR)
-_COMPRESSED = _channel("/camera/image", CompressedImage.DESCRIPTOR)
+_CALIBRATION = _channel("/camera/calibration", CameraCalibration)
+_RAW = _channel("/camera/image", RawImage)
+_COMPRESSED = _channel("/camera/image", CompressedImage)
 
 
 def calibration_message(camera: Camera, log_time_ns: int) -> Message:
@@ -76,7 +66,8 @@ def image_message(image: Image, log_time_ns: int, sequence: int) -> Message:
     return Message(channel, message.SerializeToString(), log_time_ns, log_time_ns, sequence)
 
 
-def gray_image(image: Image, frame: Frame) -> Image:
-    """Replace an image's pixels by the gray levels that a frame has of it: all a replay needs."""
-    width = frame.image.shape[1]
-    return replace(image, data=frame.image.tobytes(), encoding="mono8", step=width)
+def gray_image(frame: Frame) -> Image:
+    """Return the gray levels of a frame: all that a replay needs of its pixels."""
+    height, width = frame.image.shape
+    data = frame.image.tobytes()
+    return Image(frame.time_ns, _FRAME_ID, data, "mono8", width, height, width)

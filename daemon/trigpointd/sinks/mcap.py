@@ -1,35 +1,38 @@
-"""A log of what came in and what went out, in one MCAP file that replays as a recording."""
+"""A log of what came in and what went out, in an MCAP file that replays as a recording."""
 
 from __future__ import annotations
 
 import contextlib
-import time
-from collections.abc import Iterator
+import fcntl
+import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO
 
 from mcap.writer import CompressionType, Writer
 
+from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError, SourceError
-from trigpointd.config import LogConfig
+from trigpoint.frame import Frame
 from trigpointd.messages.cdr import POSE_SCHEMA, POSE_TYPE
+from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
 from trigpointd.pipeline import Output
+from trigpointd.sinks.log_files import cannot_write
 from trigpointd.sources.base import Captured, Channel, Message
 
 _CHUNK_BYTES = 256 * 1024
-_FLUSH_S = 1.0
 _STATUS_SCHEMA = b'{"type": "object"}'
 
 
 class McapLog:
-    """Writes a log; to be called from one thread at a time.
+    """Writes one file; to be called from one thread at a time.
 
-    A crash of the process costs the messages of the chunk in progress: at most `_CHUNK_BYTES` and,
-    while messages keep coming, `_FLUSH_S`. A loss of power costs what the operating system has not
-    yet put on the disk.
+    A crash of the process costs the messages of the chunk in progress, which are at most
+    `_CHUNK_BYTES`; a loss of power costs what came since the last `flush`. The file is locked while
+    it is open.
 
-    Where the disk is full, writing raises a `SourceError` and the log is closed; what was written
-    before can be read, and the caller goes on without a log.
+    Where the disk is full, writing raises a `SourceError` and the file is closed; what was written
+    before can be read, and a file without any message does not stay.
 
     Parameters
     ----------
@@ -38,24 +41,26 @@ class McapLog:
     base_key : str
         What the topics of poses and status begin with.
     frames : bool
-        Whether to keep the messages that the frames came from; only then does the log replay.
+        Whether to keep what the poses were made from; only then does the log replay. Messages are
+        kept as they came; frames of a source without messages are written as Foxglove's.
     overwrite : bool
         Whether to replace a file that exists.
+    about : mapping of str, optional
+        What is to be known of the whole file; it becomes the metadata record `trigpoint`.
     """
 
     def __init__(
-        self, path: Path, base_key: str, *, frames: bool = True, overwrite: bool = False
+        self,
+        path: Path,
+        base_key: str,
+        *,
+        frames: bool = True,
+        overwrite: bool = False,
+        about: Mapping[str, str] | None = None,
     ) -> None:
-        self._path = path
+        self.path = path
         self._frames = frames
-        try:
-            self._stream = path.open("wb" if overwrite else "xb")
-        except FileExistsError:
-            raise ConfigError(
-                f"the log {path} exists; name another file or allow overwriting"
-            ) from None
-        except OSError as error:
-            raise ConfigError(f"cannot write the log {path}: {error.strerror}") from error
+        self._stream = _open(path, overwrite=overwrite)
         self._pose = Channel(f"{base_key}/pose", "cdr", POSE_TYPE, "ros2msg", POSE_SCHEMA.encode())
         self._status = Channel(
             f"{base_key}/status", "json", "trigpoint.Status", "jsonschema", _STATUS_SCHEMA
@@ -63,35 +68,43 @@ class McapLog:
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self._channel_ids: dict[Channel, int] = {}
         self._calibration: Message | None = None
-        self._flushed_s = time.monotonic()
+        self._camera: Camera | None = None
         # JPEG does not shrink, and beside it the rest hardly counts; alone that shrinks by 40 %.
         compression = CompressionType.NONE if frames else CompressionType.ZSTD
         self._writer = Writer(self._stream, chunk_size=_CHUNK_BYTES, compression=compression)
+        self._start_bytes = self.num_bytes = 0
         with self._writing():
             self._writer.start(library="trigpoint")
+            if about is not None:
+                self._writer.add_metadata("trigpoint", dict(about))
+            self._stream.flush()
+            self._start_bytes = self.num_bytes = self._stream.tell()
 
-    @classmethod
-    def from_config(cls, config: LogConfig, base_key: str) -> Self:
-        """Open the log that the settings name; %Y, %H and the like in it stand for now."""
-        path = Path(time.strftime(str(config.path)))
-        return cls(path, base_key, frames=config.frames, overwrite=config.overwrite)
+    @property
+    def holds_messages(self) -> bool:
+        """Whether a chunk has reached the file."""
+        return self.num_bytes > self._start_bytes
+
+    @property
+    def is_deleted(self) -> bool:
+        """Whether nobody can find the file any more."""
+        return os.fstat(self._stream.fileno()).st_nlink == 0
 
     def publish(self, output: Output) -> None:
-        """Write the messages the frame came from, if asked to, the pose and the status."""
+        """Write what the frame came from, if asked to, the pose and the status."""
         captured, time_ns = output.captured, output.captured.log_time_ns
         if self._frames:
             self._write_input(captured)
         if output.pose is not None:
             self._write(Message(self._pose, output.pose, time_ns, time_ns))
         self._write(Message(self._status, output.status, time_ns, time_ns))
-        if time.monotonic() - self._flushed_s > _FLUSH_S:
-            self.flush()
 
     def flush(self) -> None:
-        """Close the chunk in progress and hand it to the operating system."""
+        """Close the chunk in progress and wait until the disk has it."""
         with self._writing():
             self._writer.flush()  # type: ignore[no-untyped-call]
-        self._flushed_s = time.monotonic()
+            os.fdatasync(self._stream.fileno())
+            self.num_bytes = self._stream.tell()
 
     def close(self) -> None:
         """Write the index and close the file."""
@@ -99,6 +112,8 @@ class McapLog:
             return
         with self._writing():
             self._writer.finish()  # type: ignore[no-untyped-call]
+            self._stream.flush()
+            os.fdatasync(self._stream.fileno())
             self._stream.close()
 
     def _write_input(self, captured: Captured) -> None:
@@ -107,6 +122,14 @@ class McapLog:
             self._calibration = captured.calibration
         if captured.image is not None:
             self._write(captured.image)
+        elif isinstance(captured.frame, Frame):
+            self._write_frame(captured.frame, captured.log_time_ns)
+
+    def _write_frame(self, frame: Frame, time_ns: int) -> None:
+        if frame.camera != self._camera:
+            self._write(calibration_message(frame.camera, time_ns))
+            self._camera = frame.camera
+        self._write(image_message(gray_image(frame), time_ns, 0))
 
     def _write(self, message: Message) -> None:
         with self._writing():
@@ -118,6 +141,7 @@ class McapLog:
                 message.sequence,
             )
             self._stream.flush()  # without effect unless a chunk was just closed
+            self.num_bytes = self._stream.tell()
 
     def _channel_id(self, channel: Channel) -> int:
         if channel not in self._channel_ids:
@@ -137,12 +161,38 @@ class McapLog:
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
         if self._stream.closed:
-            raise SourceError(f"the log {self._path} is closed")
+            raise SourceError(f"the log {self.path} is closed")
         try:
             yield
         except OSError as error:
             with contextlib.suppress(OSError):  # it tries to write the rest once more
                 self._stream.close()
-            raise SourceError(
-                f"cannot write the log {self._path}: {error.strerror}; it ends here"
-            ) from error
+            if not self.holds_messages:
+                with contextlib.suppress(OSError):
+                    self.path.unlink()
+            raise cannot_write(self.path, error) from error
+
+
+def _open(path: Path, *, overwrite: bool) -> BinaryIO:
+    """Open and lock a file, and see to it that its name survives a loss of power."""
+    try:
+        stream = path.open("ab" if overwrite else "xb")
+    except FileExistsError:
+        raise ConfigError(
+            f"the log {path} exists; name another file or allow overwriting"
+        ) from None
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        stream.close()
+        raise ConfigError(f"another daemon is writing the log {path}; name another one") from None
+    except OSError:
+        pass  # a file system without locks
+    with contextlib.suppress(OSError):  # not every file system can
+        stream.truncate(0)
+        folder = os.open(path.parent, os.O_RDONLY)
+        os.fsync(folder)
+        os.close(folder)
+    return stream

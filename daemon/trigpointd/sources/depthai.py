@@ -185,7 +185,7 @@ class DepthaiSource:
         except SourceError as error:
             bad = BadFrame(arrival_ns, name, str(error))
             return Captured(bad, arrival_ns, num_missed=self._num_missed)
-        message = image_message(gray_image(parsed, frame), arrival_ns, sequence)
+        message = image_message(gray_image(frame), arrival_ns, sequence)
         return Captured(frame, arrival_ns, message, self._calibration, self._num_missed)
 
     def _stop(self) -> None:

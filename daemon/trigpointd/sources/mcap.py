@@ -3,17 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import logging
-import struct
-from collections.abc import AsyncGenerator, Collection, Iterator
+from collections.abc import AsyncGenerator, Iterator
+from dataclasses import replace
 from pathlib import Path
-
-import zstandard
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.records import Channel as McapChannel
-from mcap.records import Schema
-from mcap.writer import MCAP0_MAGIC
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError, SourceError
@@ -28,21 +20,10 @@ from trigpointd.messages.images import (
     to_frame,
 )
 from trigpointd.sources.base import BadFrame, Captured, Channel, Message
+from trigpointd.sources.recording import Recording
 
-_log = logging.getLogger(__name__)
-# What mcap and its decompressors (lz4: RuntimeError) raise on bytes that are not as they should
-# be, and a disk that fails.
-_DAMAGE = (
-    McapError,
-    zstandard.ZstdError,
-    struct.error,
-    ValueError,
-    LookupError,
-    RuntimeError,
-    MemoryError,
-    OverflowError,
-    OSError,
-)
+_NEVER_S = 1e9
+_ONLY_FRAME_NS = 10**8  # how long a recording of a single frame lasts, in a loop
 
 
 class McapSource:
@@ -56,22 +37,44 @@ class McapSource:
         Needed only where the recording holds several cameras.
     rate : float, optional
         1 plays at the recorded pace, 2 twice as fast; None as fast as the frames are taken.
+    start_s, end_s : float
+        Which part to play, in seconds since the first image, by the times of arrival; the end,
+        which is not played any more, is that of the recording by default.
+    loop : bool
+        Whether to begin again at the end. All times then go on from where they were, so that they
+        rise: what comes in the second round is stamped as if the recording went on at its mean
+        pace. The messages that it came from, which say otherwise, do not come along.
     """
 
     live = False
 
     def __init__(
-        self, path: Path, *, image_topic: str | None = None, rate: float | None = None
+        self,
+        path: Path,
+        *,
+        image_topic: str | None = None,
+        rate: float | None = None,
+        start_s: float = 0.0,
+        end_s: float | None = None,
+        loop: bool = False,
     ) -> None:
         if rate is not None and not rate > 0:
             raise ConfigError(f"a replay at rate {rate} is not possible; give a rate above 0")
+        end_s = _NEVER_S if end_s is None else min(end_s, _NEVER_S)
+        if not 0 <= start_s < end_s:
+            raise ConfigError(
+                f"a replay from {start_s:g} s to {end_s:g} s is not possible; give a start of 0 or "
+                "more and an end after it"
+            )
         self._rate = rate
-        self._recording = _Recording(path)
+        self._loop = loop
+        self._recording = Recording(path)
         try:
             self._image_topic = _choose_image_topic(self._recording, image_topic)
             self._rectified = is_rectified(self._image_topic)
             self._calibration = _choose_calibration(self._recording, self._image_topic)
             self._camera(self._calibration)
+            self._choose_part(start_s, end_s)
         except SourceError as error:
             self._recording.close()
             raise SourceError(f"recording {path}: {error}") from error
@@ -111,11 +114,45 @@ class McapSource:
         """Close the file."""
         self._recording.close()
 
+    def _choose_part(self, start_s: float, end_s: float) -> None:
+        """Set the times of arrival between which to play, and the calibration at the start."""
+        topic, first = self._image_topic, self._recording.first(self._image_topic)
+        assert first is not None  # else the topic would not have been chosen
+        self._start_ns = first.log_time_ns + round(start_s * 1e9)
+        self._end_ns = first.log_time_ns + round(end_s * 1e9)
+        if start_s == 0:
+            self._start_ns = 0  # with calibrations before the first image
+            return
+        if self._recording.first(topic, self._start_ns, self._end_ns) is None:
+            last = max(message.log_time_ns for message in self._recording.messages([topic]))
+            end = "" if end_s == _NEVER_S else f" to {end_s:g} s"
+            last_s = (last - first.log_time_ns) / 1e9
+            raise SourceError(f"no images from {start_s:g} s{end}; the last is at {last_s:.3f} s")
+        for message in self._recording.messages(
+            [self._calibration.channel.topic], end_ns=self._start_ns
+        ):
+            self._calibration = message
+
     def _captures(self) -> Iterator[Captured]:
+        """Yield what is played, in a loop all of it again and again, at later times."""
+        if not self._loop:
+            yield from self._round()
+            return
+        shift_ns = count = 0
+        while True:
+            times_ns = []  # of arrival and of capture
+            for captured in self._round(count):
+                times_ns.append((captured.log_time_ns, captured.frame.time_ns))
+                yield _shifted(captured, shift_ns)
+            length_ns = max(max(times) - min(times) for times in zip(*times_ns, strict=True))
+            shift_ns += length_ns + (length_ns // max(1, len(times_ns) - 1) or _ONLY_FRAME_NS)
+            count += len(times_ns)
+
+    def _round(self, count: int = 0) -> Iterator[Captured]:
         # An image before the first calibration takes that one, all others the newest before them.
-        calibration, count = self._calibration, 0
+        calibration = self._calibration
         topics = {self._image_topic, calibration.channel.topic}
-        for message in self._recording.messages(topics):
+        for message in self._recording.messages(topics, self._start_ns, self._end_ns):
             if message.channel.topic != self._image_topic:
                 calibration = message
                 continue
@@ -138,99 +175,17 @@ class McapSource:
         return parsed.camera(rectified=self._rectified)
 
 
-class _Recording:
-    """The messages of a file, through its index where it has one."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        try:
-            self._stream = path.open("rb")
-        except OSError as error:
-            raise SourceError(f"cannot open recording {path}: {error.strerror}") from error
-        try:
-            self._examine()
-        except SourceError as error:
-            self.close()
-            raise SourceError(f"recording {path}: {error}") from error
-        if self.cut_off:
-            _log.warning("recording %s is cut off; playing what was written whole", path)
-
-    def _examine(self) -> None:
-        """Find the channels, and whether there is an index and an end."""
-        magic = self._stream.read(len(MCAP0_MAGIC))
-        if magic != MCAP0_MAGIC:
-            raise SourceError("not an MCAP file" if magic else "the file is empty")
-        size = self._stream.seek(0, 2)
-        self._stream.seek(size - len(MCAP0_MAGIC))
-        self.cut_off = size < 2 * len(magic) or self._stream.read() != MCAP0_MAGIC
-        self._indexed = False
-        try:
-            summary = None if self.cut_off else self._seeking_reader().get_summary()
-        except _DAMAGE as error:
-            raise _damage(error) from error
-        if summary is not None and summary.chunk_indexes and summary.channels:
-            self._indexed = True
-            self.channels = tuple(
-                _channel(channel, summary.schemas.get(channel.schema_id))
-                for channel in summary.channels.values()
-            )
-        else:
-            self.channels = tuple({message.channel: None for message in self.messages(None)})
-
-    def _seeking_reader(self) -> SeekingReader:
-        self._stream.seek(0)
-        return SeekingReader(self._stream, validate_crcs=True)
-
-    def messages(self, topics: Collection[str] | None) -> Iterator[Message]:
-        """Yield messages in the order of their log times, without an index in that of the file."""
-        channels: dict[int, Channel] = {}
-        try:
-            if self._indexed:
-                found = self._seeking_reader().iter_messages(topics)
-            else:
-                self._stream.seek(0)
-                reader = NonSeekingReader(self._stream, validate_crcs=True)
-                found = reader.iter_messages(topics, log_time_order=False)
-            for schema, channel, message in found:
-                if channel.id not in channels:
-                    channels[channel.id] = _channel(channel, schema)
-                yield Message(
-                    channels[channel.id],
-                    message.data,
-                    message.log_time,
-                    message.publish_time,
-                    message.sequence,
-                )
-        except _DAMAGE as error:
-            if not self.cut_off:
-                raise _damage(error) from error
-
-    def first(self, topic: str) -> Message | None:
-        """Return the first message on a topic."""
-        return next(self.messages([topic]), None)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._stream.close()
-
-
-def _channel(channel: McapChannel, schema: Schema | None) -> Channel:
-    topic, encoding = channel.topic, channel.message_encoding
-    if schema is None:
-        return Channel(topic, encoding, "", "", b"")
-    return Channel(topic, encoding, schema.name, schema.encoding, schema.data)
+def _shifted(captured: Captured, shift_ns: int) -> Captured:
+    """Return a frame at another time, without the messages that tell the one it was taken at."""
+    frame = replace(captured.frame, time_ns=captured.frame.time_ns + shift_ns)
+    return Captured(frame, captured.log_time_ns + shift_ns)
 
 
 def _type(channel: Channel) -> tuple[str, str]:
     return channel.message_encoding, channel.schema_name
 
 
-def _damage(error: BaseException) -> SourceError:
-    detail = str(error) or type(error).__name__
-    return SourceError(f"the file is damaged ({detail}); try `mcap recover`")
-
-
-def _choose_image_topic(recording: _Recording, wanted: str | None) -> str:
+def _choose_image_topic(recording: Recording, wanted: str | None) -> str:
     found = sorted({c.topic for c in recording.channels if _type(c) in IMAGE_TYPES})
     topics = [topic for topic in found if recording.first(topic) is not None]
     if wanted is not None and wanted not in topics:
@@ -243,7 +198,7 @@ def _choose_image_topic(recording: _Recording, wanted: str | None) -> str:
     return wanted or topics[0]
 
 
-def _choose_calibration(recording: _Recording, image_topic: str) -> Message:
+def _choose_calibration(recording: Recording, image_topic: str) -> Message:
     """Return the first calibration of the camera of an image topic.
 
     It lies in a namespace around the images (`/cam/camera_info` for `/cam/image_raw/compressed`),

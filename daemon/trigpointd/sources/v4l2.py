@@ -178,7 +178,7 @@ class V4l2Source:
             bad = BadFrame(arrival_ns, name, str(error))
             return Captured(bad, arrival_ns, num_missed=self._num_missed)
         if encoding is not None:
-            image = gray_image(image, frame)
+            image = gray_image(frame)
         message = image_message(image, arrival_ns, raw.sequence)
         return Captured(frame, arrival_ns, message, self._calibration, self._num_missed)
 
