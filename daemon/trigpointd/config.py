@@ -187,7 +187,7 @@ class Config(Section):
     map: Path
     base_key: Annotated[str, Field(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] = "trigpoint/device"
     map_frame: str = "map"  # frame_id of the poses
-    source: Annotated[McapConfig | DepthaiConfig, Field(discriminator="type")]
+    source: SourceConfig
     camera: CameraConfig = CameraConfig()
     model: ModelConfig = ModelConfig()
     localizer: LocalizerOptions = LocalizerOptions()

@@ -38,6 +38,7 @@ from trigpointd.service import serve
 from trigpointd.sources.base import BadFrame, Captured
 from trigpointd.sources.depthai import DepthaiSource, choose_device, open_camera, set_exposure
 
+os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")  # as the source does
 dai = pytest.importorskip(
     "depthai", reason="OAK cameras need the extra `oak`: pip install 'trigpoint[oak]'"
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import time
 from collections.abc import AsyncGenerator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -275,6 +276,8 @@ def _camera(transformation: Any) -> Camera:
 
 
 def _import_depthai() -> Any:
+    # It would take over signals that Python handles, such as that of a file that is too large.
+    os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
     try:
         import depthai
     except ImportError as error:
