@@ -351,11 +351,17 @@ def test_a_camera_that_is_unplugged_and_comes_back_is_said_once_each(
     log: pytest.LogCaptureFixture,
 ) -> None:
     absent = [OSError(errno.ENOENT, "No such file or directory")] * 20
-    kernel = FakeKernel(Plugged([filled(0), NODEV]), *absent, Plugged([filled(1)]))
-    captures = take(kernel, 2)
-    assert [captured.frame.name for captured in captures] == ["video7#0", "video7#1"]
-    assert kernel.num_opened == 22
-    assert log.messages == [GIVES, GONE, GIVES]
+    kernel = FakeKernel(
+        Plugged([filled(0), filled(1), NODEV]),
+        *absent,
+        Plugged([filled(2), filled(3), NODEV]),
+        *absent,
+        Plugged([filled(4), filled(5)]),
+    )
+    captures = take(kernel, 6)
+    assert [captured.frame.name for captured in captures] == [f"video7#{i}" for i in range(6)]
+    assert kernel.num_opened == 43
+    assert log.messages == [GIVES, GONE, GIVES, GONE, GIVES]
 
 
 def test_a_camera_that_is_not_there_at_the_start_is_waited_for(
