@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import json
 import logging
 import sys
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +21,8 @@ from trigpoint.models.features import find_model
 from trigpoint.output import check_output, open_text
 from trigpoint.poses import format_pose
 from trigpointd.config import Config, LogConfig, ModelConfig, SourceConfig, ZenohConfig, load_config
-from trigpointd.service import open_pipeline, open_source, run
+from trigpointd.pipeline import open_pipeline
+from trigpointd.service import open_source, run
 from trigpointd.sinks.zenoh import make_settings
 from trigpointd.watch import Received, subscribe
 
@@ -49,8 +52,12 @@ def _set_up(
 def run_command(
     config: Annotated[Path, typer.Option(help="Settings, a TOML file.")],
 ) -> None:
-    """Localize frames and publish poses, until the recording ends or SIGTERM comes."""
-    totals = run(load_config(config))
+    """Localize frames and publish poses, until the recording ends or SIGTERM comes.
+
+    SIGHUP takes up the settings, the networks and the map anew, but for source and outputs.
+    """
+    faulthandler.enable()  # systemd's watchdog ends a hang by SIGABRT: where it hung is then said
+    totals = run(load_config(config), read=partial(load_config, config))
     logging.getLogger(__name__).info("%s", totals)
 
 

@@ -17,8 +17,9 @@ pytestmark = [
 @pytest.fixture(params=["trigpointd.service", "trigpointd@.service"])
 def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A unit as it is installed, but with a program that is there."""
-    text = (SYSTEMD / request.param).read_text()
-    installed = tmp_path / request.param
+    name: str = request.param
+    text = (SYSTEMD / name).read_text()
+    installed = tmp_path / name
     installed.write_text(text.replace("/usr/local/lib/trigpoint/bin/trigpointd", sys.executable))
     return installed
 
