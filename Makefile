@@ -8,8 +8,14 @@ DATA := ../shared/data
 KITCHEN := $(DATA)/7scenes_redkitchen
 # Everyday pictures without poses, a tenth of which no training sees.
 PHOTOGRAPHS := ../shared/train_images/images
+# `make install`, docs/install.md: packages set DESTDIR and PREFIX=/usr; EXTRAS=oak for OAK cameras.
+PREFIX ?= /usr/local
+EXTRAS ?=
+LIB = $(DESTDIR)$(PREFIX)/lib
+SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
 .PHONY: demo test test-oak test-v4l2 check golden bench bench-models bench-localizer wheel-test clean
+.PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
 $(READY): pyproject.toml
@@ -91,6 +97,35 @@ test-oak: $(READY)
 	  $(BIN)/python -m pip install --quiet --editable '.[oak]'; \
 	fi
 	$(BIN)/python -m pytest tests/daemon/test_depthai_source.py
+
+install: install-program install-units
+
+install-program:
+	$(PYTHON) -m venv --clear '$(LIB)/trigpoint'
+	'$(LIB)/trigpoint/bin/python' -m pip install --quiet '.$(if $(EXTRAS),[$(EXTRAS)])'
+ifneq ($(DESTDIR),) # where scripts look for their interpreter
+	grep -rlI '$(abspath $(DESTDIR))' '$(LIB)/trigpoint/bin' | xargs sed -i 's|$(abspath $(DESTDIR))||g'
+endif
+	install -d '$(DESTDIR)$(PREFIX)/bin'
+	ln -sf ../lib/trigpoint/bin/trigpointd ../lib/trigpoint/bin/trigpoint-db '$(DESTDIR)$(PREFIX)/bin'
+
+# Settings that are there already stay.
+install-units:
+	install -d '$(LIB)/systemd/system'
+	for unit in trigpointd trigpointd@; do \
+	  sed 's|/usr/local|$(PREFIX)|' systemd/$$unit.service >'$(LIB)/systemd/system/'$$unit.service; done
+	install -Dm644 systemd/70-trigpoint.rules '$(LIB)/udev/rules.d/70-trigpoint.rules'
+	install -Dm644 systemd/trigpoint.sysusers '$(LIB)/sysusers.d/trigpoint.conf'
+	install -Dm644 systemd/trigpoint.tmpfiles '$(LIB)/tmpfiles.d/trigpoint.conf'
+	test -e '$(SETTINGS)' || install -Dm644 systemd/trigpoint.toml '$(SETTINGS)'
+
+# Leaves settings, maps and logs.
+uninstall:
+	rm -rf '$(LIB)/trigpoint'
+	rm -f '$(DESTDIR)$(PREFIX)/bin/trigpointd' '$(DESTDIR)$(PREFIX)/bin/trigpoint-db' \
+	  '$(LIB)/systemd/system/trigpointd.service' '$(LIB)/systemd/system/trigpointd@.service' \
+	  '$(LIB)/udev/rules.d/70-trigpoint.rules' '$(LIB)/sysusers.d/trigpoint.conf' \
+	  '$(LIB)/tmpfiles.d/trigpoint.conf'
 
 clean:
 	rm -rf .venv build dist

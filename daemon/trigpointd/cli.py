@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import json
 import logging
 import sys
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -28,7 +30,8 @@ from trigpointd.config import (
     explain,
     load_config,
 )
-from trigpointd.service import open_pipeline, open_source, run
+from trigpointd.pipeline import open_pipeline
+from trigpointd.service import open_source, run
 from trigpointd.sinks.log_files import LogFiles
 from trigpointd.sinks.zenoh import make_settings
 from trigpointd.watch import Received, subscribe
@@ -59,8 +62,12 @@ def _set_up(
 def run_command(
     config: Annotated[Path, typer.Option(help="Settings, a TOML file.")],
 ) -> None:
-    """Localize frames and publish poses, until the recording ends or SIGTERM comes."""
-    totals = run(load_config(config))
+    """Localize frames and publish poses, until the recording ends or SIGTERM comes.
+
+    SIGHUP takes up the settings, the networks and the map anew, but for source and outputs.
+    """
+    faulthandler.enable()  # systemd's watchdog ends a hang by SIGABRT: where it hung is then said
+    totals = run(load_config(config), read=partial(load_config, config))
     logging.getLogger(__name__).info("%s", totals)
 
 

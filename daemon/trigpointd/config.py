@@ -15,6 +15,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    PlainSerializer,
     PlainValidator,
     ValidationError,
     ValidationInfo,
@@ -65,7 +66,8 @@ class V4l2Config(Section):
 
     type: Literal["v4l2"]
     device: Path
-    camera: Annotated[Camera, PlainValidator(_parse_camera)]  # intrinsics; its size is asked for
+    # Intrinsics; their size is asked for.
+    camera: Annotated[Camera, PlainValidator(_parse_camera), PlainSerializer(Camera.to_text)]
     format: Literal["YUYV", "GREY", "NV12", "MJPG"] = "YUYV"
     fps: Annotated[float, Field(gt=0, le=1000)] | None = None  # without: the driver's choice
     timeout_s: Annotated[float, Field(gt=0)] = 5.0  # without a usable frame: opened again

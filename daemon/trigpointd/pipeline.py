@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import DatabaseError, ModelError
 from trigpoint.frame import Failed, Frame, Localized, Result, describe, summarize
 from trigpoint.localizer import Localizer
+from trigpoint.models.features import FeatureModel
+from trigpoint.models.matching import load_matcher
 from trigpoint.rigid import Rigid3
+from trigpointd.config import Config
 from trigpointd.messages.cdr import encode_pose
 from trigpointd.messages.pose import body_pose
 from trigpointd.sources.base import BadFrame, Captured
@@ -110,3 +114,20 @@ class Pipeline:
                 _log.error("%s", error)
             reason = "BAD_MAP" if isinstance(error, DatabaseError) else "BAD_NETWORK"
             return Failed(reason, str(error))
+
+
+@contextlib.contextmanager
+def open_pipeline(config: Config) -> Iterator[Pipeline]:
+    """Load the networks and open the map."""
+    settings = config.model
+    model = FeatureModel.load(
+        settings.network, retrieval=settings.retrieval, num_threads=settings.num_threads
+    )
+    matcher = load_matcher(
+        settings.matcher, model.identity.descriptor_dim, num_threads=settings.num_threads
+    )
+    with MapReader.open(config.map, model.identity) as reader:
+        localizer = Localizer(
+            model, reader, config.localizer, clock=time.perf_counter, matcher=matcher
+        )
+        yield Pipeline(localizer, reader, config.camera.body_from_camera, config.map_frame)

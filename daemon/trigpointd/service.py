@@ -6,24 +6,20 @@ import asyncio
 import contextlib
 import logging
 import signal
-import time
 from collections import Counter
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from trigpoint.database.reader import MapReader
 from trigpoint.errors import TrigpointError
-from trigpoint.localizer import Localizer
-from trigpoint.models.features import FeatureModel
-from trigpoint.models.matching import load_matcher
 from trigpoint.output import check_output
 from trigpointd.config import Config, McapConfig, V4l2Config
 from trigpointd.latest import Latest
 from trigpointd.pipeline import Output, Pipeline
-from trigpointd.sd_notify import notify
+from trigpointd.reload import Reloads
+from trigpointd.sd_notify import Heartbeat, notify
 from trigpointd.sinks.base import Sink
 from trigpointd.sinks.poses import PoseFile
 from trigpointd.sinks.recorder import Recorder
@@ -33,6 +29,8 @@ from trigpointd.sources.base import Captured, Source
 from trigpointd.sources.depthai import DepthaiSource
 from trigpointd.sources.mcap import McapSource
 from trigpointd.sources.v4l2 import V4l2Source
+
+First = Callable[[], Coroutine[None, None, None]]
 
 _log = logging.getLogger(__name__)
 
@@ -49,17 +47,24 @@ class Totals:
         return f"{counts or 'no frames'}, {self.num_dropped} dropped"
 
 
-def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink] = ()) -> Totals:
+def run(
+    config: Config,
+    *,
+    read: Callable[[], Config] | None = None,
+    poses: Path | None = None,
+    extra_sinks: Sequence[Sink] = (),
+) -> Totals:
     """Run until the recording ends or SIGTERM or SIGINT comes; everything is closed in order.
 
-    `poses` names a file for the poses. What is written is opened after all that is read.
+    With `read`, SIGHUP takes up the settings that it returns. `poses` names a file for the poses.
+    What is written is opened after all that is read.
     """
     inputs = [config.map]
     if isinstance(config.source, McapConfig):
         inputs.append(config.source.path)
     check_output(poses, *inputs)
     with ExitStack() as stack:
-        pipeline = stack.enter_context(open_pipeline(config))
+        reloads = stack.enter_context(contextlib.closing(Reloads(config, read)))
         source = open_source(config)
         sinks = list(extra_sinks)
         first = None
@@ -83,24 +88,7 @@ def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink
         if poses is not None:
             sinks.append(PoseFile(poses))
             stack.callback(sinks[-1].close)
-        return asyncio.run(_run_until_signal(source, pipeline, sinks, first))
-
-
-@contextlib.contextmanager
-def open_pipeline(config: Config) -> Iterator[Pipeline]:
-    """Load the networks and open the map."""
-    settings = config.model
-    model = FeatureModel.load(
-        settings.network, retrieval=settings.retrieval, num_threads=settings.num_threads
-    )
-    matcher = load_matcher(
-        settings.matcher, model.identity.descriptor_dim, num_threads=settings.num_threads
-    )
-    with MapReader.open(config.map, model.identity) as reader:
-        localizer = Localizer(
-            model, reader, config.localizer, clock=time.perf_counter, matcher=matcher
-        )
-        yield Pipeline(localizer, reader, config.camera.body_from_camera, config.map_frame)
+        return asyncio.run(_run_until_signal(source, reloads, sinks, first))
 
 
 def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
@@ -119,46 +107,41 @@ def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
 
 
 async def _run_until_signal(
-    source: Source,
-    pipeline: Pipeline,
-    sinks: Sequence[Sink],
-    first: Callable[[], Coroutine[None, None, None]] | None,
+    source: Source, reloads: Reloads, sinks: Sequence[Sink], first: First | None
 ) -> Totals:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
+    if reloads.read is not None:
+        loop.add_signal_handler(signal.SIGHUP, reloads.request)
     notify("READY=1")
     _log.info("localizing")
     try:
-        if first is not None:
-            await _unless(stop, first())
-        return await serve(source, pipeline, sinks, stop)
+        return await serve(source, reloads.pipeline, sinks, stop, first=first, reloads=reloads)
     finally:
         notify("STOPPING=1")
 
 
-async def _unless(stop: asyncio.Event, work: Coroutine[None, None, None]) -> None:
-    """Do something, but not on once `stop` is set."""
-    working = asyncio.create_task(work)
-    stopping = asyncio.create_task(stop.wait())
-    await asyncio.wait([working, stopping], return_when=asyncio.FIRST_COMPLETED)
-    stopping.cancel()
-    if working.cancel():
-        return
-    working.result()
-
-
 async def serve(
-    source: Source, pipeline: Pipeline, sinks: Sequence[Sink], stop: asyncio.Event
+    source: Source,
+    pipeline: Pipeline,
+    sinks: Sequence[Sink],
+    stop: asyncio.Event,
+    *,
+    first: First | None = None,
+    reloads: Reloads | None = None,
 ) -> Totals:
-    """Localize frames until the source ends or `stop` is set; what is in work is published."""
+    """Localize frames until the source ends or `stop` is set; what is in work is published.
+
+    The source is not asked for frames before `first` is done.
+    """
     slot = Latest[Captured](lossless=not source.live)
     totals = Totals()
-    feeding = asyncio.create_task(_feed(source, slot))
+    feeding = asyncio.create_task(_feed(source, slot, first))
     stopping = asyncio.create_task(_cancel_on(stop, feeding))
     try:
-        await _localize(slot, pipeline, list(sinks), totals)
+        await _localize(slot, pipeline, list(sinks), totals, reloads)
     finally:
         stopping.cancel()
         feeding.cancel()
@@ -169,9 +152,11 @@ async def serve(
     return totals
 
 
-async def _feed(source: Source, slot: Latest[Captured]) -> None:
+async def _feed(source: Source, slot: Latest[Captured], first: First | None) -> None:
     """Bring frames to the slot; a source that fails ends the stream, after what it brought."""
     try:
+        if first is not None:
+            await first()
         async with contextlib.aclosing(source.frames()) as frames:
             async for captured in frames:
                 await slot.put(captured)
@@ -186,15 +171,31 @@ async def _cancel_on(stop: asyncio.Event, task: asyncio.Task[None]) -> None:
 
 
 async def _localize(
-    slot: Latest[Captured], pipeline: Pipeline, sinks: list[Sink], totals: Totals
+    slot: Latest[Captured],
+    pipeline: Pipeline,
+    sinks: list[Sink],
+    totals: Totals,
+    reloads: Reloads | None,
 ) -> None:
-    while (captured := await slot.get()) is not None:
+    heartbeat = Heartbeat()
+    while True:
+        if reloads is not None and reloads.is_due:
+            pipeline = await asyncio.to_thread(reloads.reload)
+        heartbeat.beat(totals)
+        try:
+            async with asyncio.timeout(heartbeat.period_s):
+                captured = await slot.get()
+        except TimeoutError:
+            continue
+        if captured is None:
+            return
         output = await asyncio.to_thread(
             pipeline.process, captured, slot.num_dropped, _log_report(sinks)
         )
         _publish(sinks, output)
         totals.outcomes[output.outcome] += 1
         totals.num_dropped = slot.num_dropped
+        heartbeat.frame(output.outcome)
 
 
 def _log_report(sinks: list[Sink]) -> dict[str, object]:

@@ -90,6 +90,7 @@ def test_a_cameras_intrinsics_are_read_as_colmap_writes_them(tmp_path: Path) -> 
     assert source.device == Path("/dev/video0")
     assert source.camera == Camera("PINHOLE", 640, 480, (460, 461, 319.5, 239.5))
     assert (source.format, source.fps) == ("YUYV", None)
+    assert "PINHOLE 640 480 460" in source.model_dump_json()
 
 
 @pytest.mark.parametrize(

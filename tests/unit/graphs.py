@@ -201,6 +201,35 @@ def for_one_size(path: Path, height: int, width: int) -> Path:
     return graph.save(path, outputs, metadata=contract.to_json())
 
 
+def hangs_on_white(path: Path) -> Path:
+    """Dense, with a global descriptor; never returns where the first pixel is white."""
+    graph = Graph(image=[1, 1, "height", "width"])
+    flat = graph.add("Reshape", "image", graph.integers(-1))
+    is_white = graph.add("Floor", graph.add("Gather", flat, graph.constant(0, np.int64)))
+    forever = graph.constant(2**62, np.int64)
+    num_turns = graph.add("Mul", graph.add("Cast", is_white, to=TensorProto.INT64), forever)
+    kinds = {"turn": TensorProto.INT64, "goes_on": TensorProto.BOOL, "zero": TensorProto.FLOAT}
+    inputs = [helper.make_tensor_value_info(name, kind, []) for name, kind in kinds.items()]
+    outputs = [
+        helper.make_tensor_value_info(f"{name}_", kinds[name], []) for name in ("goes_on", "zero")
+    ]
+    nodes = [helper.make_node("Identity", [value.name[:-1]], [value.name]) for value in outputs]
+    body = helper.make_graph(nodes, "turn", inputs, outputs)
+    zero = graph.add(
+        "Loop", num_turns, graph.constant(True, np.bool_), graph.constant(0.0), body=body
+    )
+    filters = graph.constant(random("hangs", DIM, 1, 8, 8))
+    desc = graph.add("Conv", "image", filters, strides=[8, 8])
+    pooled = graph.add("Flatten", graph.add("GlobalAveragePool", graph.add("Relu", desc)))
+    outputs_of_network: dict[str, tuple[str, Shape]] = {
+        "score": (graph.add("Add", "image", zero), [1, 1, "height", "width"]),
+        "desc": (desc, [1, DIM, "rows", "columns"]),
+        "global": (pooled, [1, DIM]),
+    }
+    contract = FeaturesContract(name="hangs", descriptor_dim=DIM, global_dim=DIM, multiple_of=8)
+    return graph.save(path, outputs_of_network, metadata=contract.to_json())
+
+
 def eigenplaces_like(path: Path, height: int = 320, width: int = 320) -> Path:
     """Retrieval: an image of ImageNet's normalisation and of one size to a vector."""
     graph = Graph(img=[1, 3, height, width])
