@@ -7,11 +7,21 @@ import difflib
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
+from trigpoint.camera import MAX_SIDE_PX, Camera
 from trigpoint.errors import ConfigError
 from trigpoint.models.features import Profile
 from trigpoint.options import LocalizerOptions
@@ -72,14 +82,60 @@ class ModelConfig(Section):
         return network
 
 
+def _parse_camera(text: object) -> Camera:
+    if not isinstance(text, str):
+        raise ValueError("must be a text, 'MODEL width height params...'")  # noqa: TRY004
+    try:
+        return Camera.from_text(text)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+
+
+CameraText = Annotated[Camera, PlainValidator(_parse_camera), PlainSerializer(Camera.to_text)]
+
+
+class TlsConfig(Section):
+    """Encryption, and who may do what, by the common names in their certificates."""
+
+    ca: Path  # PEM, as the others; who signed the certificates of all that take part
+    certificate: Path
+    private_key: Path
+    readers: tuple[str, ...] = ()  # may receive poses and status
+    operators: tuple[str, ...] = ()  # may also send requests
+
+
+class RequestsConfig(Section):
+    """What peers may ask the daemon for."""
+
+    allow: tuple[Literal["localize", "map", "change_map", "config"], ...] = (
+        "localize",
+        "map",
+        "config",
+    )
+    cameras: dict[str, CameraText] = {}  # that requests may name
+    max_payload_bytes: Annotated[int, Field(ge=1, le=2**28)] = 4 * 2**20
+    max_side_px: Annotated[int, Field(ge=1, le=MAX_SIDE_PX)] = 4096
+    max_rate_hz: Annotated[float, Field(gt=0)] = 5.0  # of each kind
+    max_waiting: Annotated[int, Field(ge=1, le=1000)] = 4
+
+
 class ZenohConfig(Section):
-    """How to reach subscribers."""
+    """How to reach subscribers, and who may do what."""
 
     mode: Literal["peer", "client"] = "peer"
     listen: tuple[str, ...] = ()  # endpoints, such as "tcp/127.0.0.1:7447"
     connect: tuple[str, ...] = ()
     multicast_scouting: bool = True
     wait_for_subscriber_s: Annotated[float, Field(ge=0)] = 0.0  # before the first frame
+    requests: RequestsConfig = RequestsConfig()
+    tls: TlsConfig | None = None
+
+    @model_validator(mode="after")
+    def _all_encrypted(self) -> Self:
+        plain = [e for e in (*self.listen, *self.connect) if not e.startswith("tls/")]
+        if self.tls is not None and plain:
+            raise ValueError(f"with [zenoh.tls], {plain[0]!r} must begin with tls/")
+        return self
 
 
 class LogConfig(Section):

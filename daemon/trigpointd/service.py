@@ -23,6 +23,8 @@ from trigpoint.output import check_output
 from trigpointd.config import Config
 from trigpointd.latest import Latest
 from trigpointd.pipeline import Output, Pipeline
+from trigpointd.request_queue import RequestQueue
+from trigpointd.requests import Responder
 from trigpointd.sd_notify import notify
 from trigpointd.sinks.base import Sink
 from trigpointd.sinks.mcap import McapLog
@@ -59,9 +61,11 @@ def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink
         pipeline = stack.enter_context(open_pipeline(config))
         source = open_source(config)
         sinks = list(extra_sinks)
-        first = None
+        first = requests = None
         if config.zenoh is not None:
-            zenoh = ZenohSink(config.zenoh, config.base_key)
+            limits = config.zenoh.requests
+            requests = RequestQueue(limits, Responder(config, limits, pipeline).answer)
+            zenoh = ZenohSink(config.zenoh, config.base_key, requests)
             stack.callback(zenoh.close)
             sinks.append(zenoh)
             _log.info("poses go to %s/pose", config.base_key)
@@ -72,7 +76,7 @@ def run(config: Config, *, poses: Path | None = None, extra_sinks: Sequence[Sink
         if config.log is not None:
             sinks.append(McapLog.from_config(config.log, config.base_key))
             stack.callback(sinks[-1].close)
-        return asyncio.run(_run_until_signal(source, pipeline, sinks, first))
+        return asyncio.run(_run_until_signal(source, pipeline, sinks, first, requests))
 
 
 @contextlib.contextmanager
@@ -103,6 +107,7 @@ async def _run_until_signal(
     pipeline: Pipeline,
     sinks: Sequence[Sink],
     first: Callable[[], Coroutine[None, None, None]] | None,
+    requests: RequestQueue | None,
 ) -> Totals:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -113,7 +118,7 @@ async def _run_until_signal(
     try:
         if first is not None:
             await _unless(stop, first())
-        return await serve(source, pipeline, sinks, stop)
+        return await serve(source, pipeline, sinks, stop, requests)
     finally:
         notify("STOPPING=1")
 
@@ -130,16 +135,29 @@ async def _unless(stop: asyncio.Event, work: Coroutine[None, None, None]) -> Non
 
 
 async def serve(
-    source: Source, pipeline: Pipeline, sinks: Sequence[Sink], stop: asyncio.Event
+    source: Source,
+    pipeline: Pipeline,
+    sinks: Sequence[Sink],
+    stop: asyncio.Event,
+    requests: RequestQueue | None = None,
 ) -> Totals:
-    """Localize frames until the source ends or `stop` is set; what is in work is published."""
+    """Localize frames until the source ends or `stop` is set; what is in work is published.
+
+    Requests take turns with frames: asyncio's locks are fair, so that neither waits for more than
+    one of the others.
+    """
     slot = Latest[Captured](lossless=not source.live)
     totals = Totals()
     feeding = asyncio.create_task(_feed(source, slot))
     stopping = asyncio.create_task(_cancel_on(stop, feeding))
+    turn = asyncio.Lock()
+    answering = None if requests is None else asyncio.create_task(requests.serve(turn))
     try:
-        await _localize(slot, pipeline, list(sinks), totals)
+        await _localize(slot, pipeline, list(sinks), totals, turn)
     finally:
+        if requests is not None and answering is not None:
+            requests.close()
+            await answering  # not to leave while the pipeline is in use
         stopping.cancel()
         feeding.cancel()
         await asyncio.wait([feeding])
@@ -166,10 +184,17 @@ async def _cancel_on(stop: asyncio.Event, task: asyncio.Task[None]) -> None:
 
 
 async def _localize(
-    slot: Latest[Captured], pipeline: Pipeline, sinks: list[Sink], totals: Totals
+    slot: Latest[Captured],
+    pipeline: Pipeline,
+    sinks: list[Sink],
+    totals: Totals,
+    turn: asyncio.Lock,
 ) -> None:
-    while (captured := await slot.get()) is not None:
-        output = await asyncio.to_thread(pipeline.process, captured, slot.num_dropped)
+    while await slot.wait():
+        async with turn:
+            captured = await slot.get()
+            assert captured is not None
+            output = await asyncio.to_thread(pipeline.process, captured, slot.num_dropped)
         _publish(sinks, output)
         totals.outcomes[output.outcome] += 1
         totals.num_dropped = slot.num_dropped
