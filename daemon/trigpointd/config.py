@@ -61,13 +61,15 @@ def _parse_camera(text: object) -> Camera:
         raise ValueError(str(error)) from error
 
 
+CameraText = Annotated[Camera, PlainValidator(_parse_camera), PlainSerializer(Camera.to_text)]
+
+
 class V4l2Config(Section):
     """Frames come from a camera that Linux knows as a video device."""
 
     type: Literal["v4l2"]
     device: Path
-    # Intrinsics; their size is asked for.
-    camera: Annotated[Camera, PlainValidator(_parse_camera), PlainSerializer(Camera.to_text)]
+    camera: CameraText  # intrinsics; their size is asked for
     format: Literal["YUYV", "GREY", "NV12", "MJPG"] = "YUYV"
     fps: Annotated[float, Field(gt=0, le=1000)] | None = None  # without: the driver's choice
     timeout_s: Annotated[float, Field(gt=0)] = 5.0  # without a usable frame: opened again
@@ -140,14 +142,48 @@ class ModelConfig(Section):
         return network
 
 
+class TlsConfig(Section):
+    """Encryption, and who may do what, by the common names in their certificates."""
+
+    ca: Path  # PEM, as the others; who signed the certificates of all that take part
+    certificate: Path
+    private_key: Path
+    readers: tuple[str, ...] = ()  # may receive poses and status
+    operators: tuple[str, ...] = ()  # may also send requests
+
+
+class RequestsConfig(Section):
+    """What peers may ask the daemon for."""
+
+    allow: tuple[Literal["localize", "map", "change_map", "config"], ...] = (
+        "localize",
+        "map",
+        "config",
+    )
+    cameras: dict[str, CameraText] = {}  # that requests may name
+    max_payload_bytes: Annotated[int, Field(ge=1, le=2**28)] = 4 * 2**20
+    max_side_px: Annotated[int, Field(ge=1, le=MAX_SIDE_PX)] = 4096
+    max_rate_hz: Annotated[float, Field(gt=0)] = 5.0  # of each kind
+    max_waiting: Annotated[int, Field(ge=1, le=1000)] = 4
+
+
 class ZenohConfig(Section):
-    """How to reach subscribers."""
+    """How to reach subscribers, and who may do what."""
 
     mode: Literal["peer", "client"] = "peer"
     listen: tuple[str, ...] = ()  # endpoints, such as "tcp/127.0.0.1:7447"
     connect: tuple[str, ...] = ()
     multicast_scouting: bool = True
     wait_for_subscriber_s: Annotated[float, Field(ge=0)] = 0.0  # before the first frame
+    requests: RequestsConfig = RequestsConfig()
+    tls: TlsConfig | None = None
+
+    @model_validator(mode="after")
+    def _all_encrypted(self) -> Self:
+        plain = [e for e in (*self.listen, *self.connect) if not e.startswith("tls/")]
+        if self.tls is not None and plain:
+            raise ValueError(f"with [zenoh.tls], {plain[0]!r} must begin with tls/")
+        return self
 
 
 class LogConfig(Section):

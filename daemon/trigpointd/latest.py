@@ -30,6 +30,12 @@ class Latest(Generic[T]):
             self._items[:] = [item]
             self._changed.notify_all()
 
+    async def wait(self) -> bool:
+        """Wait for an item without taking it; False once closed and empty."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: self._items or self._closed)
+            return bool(self._items)
+
     async def get(self) -> T | None:
         """Take the item, waiting for one; None once closed and empty."""
         async with self._changed:

@@ -54,8 +54,8 @@ class Pipeline:
     def __init__(
         self, localizer: Localizer, reader: MapReader, body_from_camera: Rigid3, map_frame: str
     ) -> None:
-        self._localizer = localizer
-        self._reader = reader
+        self.localizer = localizer
+        self.reader = reader
         self._map_problem = ""
         self._reported: set[str] = set()  # what is wrong with the map or a network, said once
         self._body_from_camera = body_from_camera
@@ -70,8 +70,7 @@ class Pipeline:
         """
         start_s = time.perf_counter()
         frame = captured.frame
-        self._refresh_map()
-        result = self._localize(frame)
+        result = self.localize(frame)
         pose = None
         if isinstance(result, Localized):
             world_from_body, covariance = body_pose(
@@ -85,17 +84,22 @@ class Pipeline:
             "latency_ms": round((time.perf_counter() - start_s) * 1e3, 3),
             "num_dropped": num_dropped,
             "num_missed": captured.num_missed,
-            "map_generation": self._reader.generation,
+            "map_generation": self.reader.generation,
             **(log or {}),
         }
         return Output(captured, result, pose, json.dumps(status).encode())
+
+    def localize(self, frame: Frame | BadFrame) -> Result | Failed:
+        """Localize one frame in the map as it is now."""
+        self._refresh_map()
+        return self._localize(frame)
 
     def _refresh_map(self) -> None:
         """Take up what was added to the map; where that cannot be used, keep what there was."""
         problem = ""
         try:
-            if self._reader.refresh():
-                _log.info("the map is now of generation %d", self._reader.generation)
+            if self.reader.refresh():
+                _log.info("the map is now of generation %d", self.reader.generation)
         except DatabaseError as error:
             problem = str(error)
         if problem and problem != self._map_problem:
@@ -106,7 +110,7 @@ class Pipeline:
         if isinstance(frame, BadFrame):
             return Failed("BAD_FRAME", frame.detail)
         try:
-            return self._localizer.localize(frame)
+            return self.localizer.localize(frame)
         except (DatabaseError, ModelError) as error:
             # A damaged image of the map, or a network that fails on this frame: others may do.
             if str(error) not in self._reported:

@@ -26,14 +26,17 @@ class Reloads:
         The settings at the start.
     read : callable, optional
         Returns the settings as they are now; without it none can be taken up.
+
+    `followers` are told of each new pipeline, and of the settings that are then in force.
     """
 
     def __init__(self, config: Config, read: Callable[[], Config] | None) -> None:
-        self._config = config
+        self.config = config
         self.read = read
         self._stack = ExitStack()
         self.pipeline = self._stack.enter_context(open_pipeline(config))
         self.is_due = False
+        self.followers: list[Callable[[Config, Pipeline], None]] = []
 
     def request(self) -> None:
         """Let the next frame wait for a reload."""
@@ -53,7 +56,7 @@ class Reloads:
         except (TrigpointError, OSError) as error:
             _log.error("%s; going on with the settings as they were", error)
         else:
-            self._report(config)
+            self._take_up(config)
         notify("READY=1")
         return self.pipeline
 
@@ -61,9 +64,14 @@ class Reloads:
         """Let go of the map."""
         self._stack.close()
 
-    def _report(self, config: Config) -> None:
+    def _take_up(self, config: Config) -> None:
         _log.info("settings, networks and map taken up anew")
         fixed = sorted(Config.model_fields.keys() - RELOADABLE)
-        changed = [name for name in fixed if getattr(config, name) != getattr(self._config, name)]
+        changed = [name for name in fixed if getattr(config, name) != getattr(self.config, name)]
         if changed:
             _log.warning("changes of %s need a restart", ", ".join(changed))
+        self.config = self.config.model_copy(
+            update={name: getattr(config, name) for name in RELOADABLE}
+        )
+        for follow in self.followers:
+            follow(self.config, self.pipeline)

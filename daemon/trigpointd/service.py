@@ -19,6 +19,8 @@ from trigpointd.config import Config, McapConfig, V4l2Config
 from trigpointd.latest import Latest
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.reload import Reloads
+from trigpointd.request_queue import RequestQueue
+from trigpointd.requests import Responder
 from trigpointd.sd_notify import Heartbeat, notify
 from trigpointd.sinks.base import Sink
 from trigpointd.sinks.poses import PoseFile
@@ -67,7 +69,7 @@ def run(
         reloads = stack.enter_context(contextlib.closing(Reloads(config, read)))
         source = open_source(config)
         sinks = list(extra_sinks)
-        first = None
+        first = requests = None
         if config.log is not None:
             recording = not source.live
             log = RollingLog(
@@ -80,7 +82,11 @@ def run(
             sinks.append(Recorder(log, lossless=recording))
             stack.callback(sinks[-1].close)
         if config.zenoh is not None:
-            zenoh = ZenohSink(config.zenoh, config.base_key)
+            limits = config.zenoh.requests
+            responder = Responder(config, limits, reloads.pipeline)
+            reloads.followers.append(responder.use)
+            requests = RequestQueue(limits, responder.answer)
+            zenoh = ZenohSink(config.zenoh, config.base_key, requests)
             stack.callback(zenoh.close)
             sinks.append(zenoh)
             _log.info("poses go to %s/pose", config.base_key)
@@ -88,7 +94,7 @@ def run(
         if poses is not None:
             sinks.append(PoseFile(poses))
             stack.callback(sinks[-1].close)
-        return asyncio.run(_run_until_signal(source, reloads, sinks, first))
+        return asyncio.run(_run_until_signal(source, reloads, sinks, first, requests))
 
 
 def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
@@ -107,7 +113,11 @@ def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
 
 
 async def _run_until_signal(
-    source: Source, reloads: Reloads, sinks: Sequence[Sink], first: First | None
+    source: Source,
+    reloads: Reloads,
+    sinks: Sequence[Sink],
+    first: First | None,
+    requests: RequestQueue | None,
 ) -> Totals:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -118,7 +128,15 @@ async def _run_until_signal(
     notify("READY=1")
     _log.info("localizing")
     try:
-        return await serve(source, reloads.pipeline, sinks, stop, first=first, reloads=reloads)
+        return await serve(
+            source,
+            reloads.pipeline,
+            sinks,
+            stop,
+            first=first,
+            reloads=reloads,
+            requests=requests,
+        )
     finally:
         notify("STOPPING=1")
 
@@ -131,18 +149,25 @@ async def serve(
     *,
     first: First | None = None,
     reloads: Reloads | None = None,
+    requests: RequestQueue | None = None,
 ) -> Totals:
     """Localize frames until the source ends or `stop` is set; what is in work is published.
 
-    The source is not asked for frames before `first` is done.
+    The source is not asked for frames before `first` is done. Requests take turns with frames:
+    asyncio's locks are fair, so that neither waits for more than one of the others.
     """
     slot = Latest[Captured](lossless=not source.live)
     totals = Totals()
     feeding = asyncio.create_task(_feed(source, slot, first))
     stopping = asyncio.create_task(_cancel_on(stop, feeding))
+    turn = asyncio.Lock()
+    answering = None if requests is None else asyncio.create_task(requests.serve(turn))
     try:
-        await _localize(slot, pipeline, list(sinks), totals, reloads)
+        await _localize(slot, pipeline, list(sinks), totals, turn, reloads)
     finally:
+        if requests is not None and answering is not None:
+            requests.close()
+            await answering  # not to leave while the pipeline is in use
         stopping.cancel()
         feeding.cancel()
         await asyncio.wait([feeding])
@@ -175,23 +200,27 @@ async def _localize(
     pipeline: Pipeline,
     sinks: list[Sink],
     totals: Totals,
+    turn: asyncio.Lock,
     reloads: Reloads | None,
 ) -> None:
     heartbeat = Heartbeat()
     while True:
         if reloads is not None and reloads.is_due:
-            pipeline = await asyncio.to_thread(reloads.reload)
+            async with turn:
+                pipeline = await asyncio.to_thread(reloads.reload)
         heartbeat.beat(totals)
         try:
             async with asyncio.timeout(heartbeat.period_s):
-                captured = await slot.get()
+                if not await slot.wait():
+                    return
         except TimeoutError:
             continue
-        if captured is None:
-            return
-        output = await asyncio.to_thread(
-            pipeline.process, captured, slot.num_dropped, _log_report(sinks)
-        )
+        async with turn:
+            captured = await slot.get()
+            assert captured is not None
+            output = await asyncio.to_thread(
+                pipeline.process, captured, slot.num_dropped, _log_report(sinks)
+            )
         _publish(sinks, output)
         totals.outcomes[output.outcome] += 1
         totals.num_dropped = slot.num_dropped

@@ -4,7 +4,8 @@ TrigpointError
 ├── ConfigError      a setting, an argument or a file the user named cannot be used
 ├── SourceError      a camera or recording cannot be read
 ├── ModelError       a network cannot be loaded or does not keep the contract
-└── DatabaseError    a map cannot be opened, read or written
+├── DatabaseError    a map cannot be opened, read or written
+└── RequestError     what a peer asks for over the network cannot be done
 """
 
 
@@ -26,3 +27,7 @@ class ModelError(TrigpointError):
 
 class DatabaseError(TrigpointError):
     """A map cannot be opened, read or written."""
+
+
+class RequestError(TrigpointError):
+    """What a peer asks for over the network cannot be done."""

@@ -236,6 +236,7 @@ def describe(result: Result | Failed) -> dict[str, Any]:
         "status": "LOCALIZED",
         "reason": None,
         "center": result.cam_from_world.center.tolist(),
+        "rotation_wxyz": result.cam_from_world.inverse().quaternion.tolist(),
         "covariance": result.covariance.tolist(),
         **statistics,
     }

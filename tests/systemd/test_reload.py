@@ -1,5 +1,6 @@
 """SIGHUP: settings, networks and map are taken up anew, or all stays as it was."""
 
+import contextlib
 import json
 import shutil
 import signal
@@ -10,6 +11,9 @@ from mcap.reader import make_reader
 
 from tests.conftest import Demo
 from tests.systemd.supervisor import Supervisor, supervised, write_config
+from trigpointd.config import Config, McapConfig, RequestsConfig
+from trigpointd.reload import Reloads
+from trigpointd.requests import Request, Responder
 
 LOG = '[log]\npath = "log.mcap"\nframes = false\n'
 
@@ -99,3 +103,18 @@ def test_a_reload_needs_no_frame(demo: Demo, tmp_path: Path) -> None:
         daemon.until(localized)
         reload(daemon)
         assert "taken up anew" in stop(daemon)
+
+
+def test_requests_are_answered_by_what_was_taken_up(demo: Demo) -> None:
+    source = McapConfig(type="mcap", path=demo.recording)
+    old = Config(map=demo.map, source=source)
+    new = old.model_copy(update={"map_frame": "hall", "base_key": "trigpoint/other"})
+    with contextlib.closing(Reloads(old, lambda: new)) as reloads:
+        responder = Responder(old, RequestsConfig(), reloads.pipeline)
+        reloads.followers.append(responder.use)
+        assert reloads.reload() is reloads.pipeline
+        settings = json.loads(responder.answer(Request("config", {})).payload)
+        assert settings["map_frame"] == "hall"
+        assert settings["base_key"] == old.base_key  # needs a restart
+        info = responder.answer(Request("map", {}))
+        assert not info.is_error, info.payload

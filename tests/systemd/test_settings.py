@@ -30,13 +30,15 @@ def tables(annotation: Any) -> list[Any]:
     return [kind for kind in kinds if issubclass(kind, Section | LocalizerOptions)][:1]
 
 
-def keys() -> list[tuple[str, str, Any]]:
+def keys(kind: Any = Config, table: str = "") -> list[tuple[str, str, Any]]:
     """Every key of the settings: table, name, default."""
+    if kind is LocalizerOptions:
+        return [(table, *item) for item in defaults(kind).items()]
     found: list[tuple[str, str, Any]] = []
-    for name, field in Config.model_fields.items():
+    for name, field in kind.model_fields.items():
         kinds = tables(field.annotation)
-        found += [(name, *item) for kind in kinds for item in defaults(kind).items()]
-        found += [] if kinds else [("", name, defaults(Config)[name])]
+        found += [item for inner in kinds for item in keys(inner, f"{table}.{name}".strip("."))]
+        found += [] if kinds else [(table, name, defaults(kind)[name])]
     return found
 
 
@@ -45,7 +47,7 @@ def shown() -> dict[tuple[str, str], list[tuple[bool, Any]]]:
     said: dict[tuple[str, str], list[tuple[bool, Any]]] = {}
     table = ""
     for line in SETTINGS.read_text().splitlines():
-        if heading := re.fullmatch(r"#?\[(\w+)\]", line):
+        if heading := re.fullmatch(r"#?\[([\w.]+)\]", line):
             table = heading[1]
         elif setting := re.fullmatch(r"(#?)((\w+) = .*)", line):
             value = tomllib.loads(setting[2])[setting[3]]
@@ -58,7 +60,7 @@ def test_they_load() -> None:
 
 
 def test_they_load_with_every_line_in_force(tmp_path: Path) -> None:
-    text = re.sub(r"^#(\w+ = )", r"\1", SETTINGS.read_text(), flags=re.MULTILINE)
+    text = re.sub(r"^#(\w+ = |\[)", r"\1", SETTINGS.read_text(), flags=re.MULTILINE)
     (tmp_path / "all.toml").write_text(text)
     config = load_config(tmp_path / "all.toml")
     assert config.localizer.max_latency_ms is not None

@@ -31,6 +31,8 @@ def test_the_example_has_every_other_setting_and_is_valid() -> None:
     assert set(tables) == set(Config.model_fields) - {"localizer"}
     for name in ("source", "camera", "model", "zenoh", "log"):
         assert set(tables[name]) == set(type(getattr(config, name)).model_fields)
+    for name in ("requests", "tls"):
+        assert set(tables["zenoh"][name]) == set(type(getattr(config.zenoh, name)).model_fields)
 
 
 def test_the_example_of_a_camera_has_all_its_settings_and_is_valid() -> None:

@@ -1,4 +1,4 @@
-"""Making a map and adding images to it."""
+"""Making a map, adding images to it and removing them."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from trigpoint.rigid import Rigid3
 
 
 class MapWriter:
-    """Adds images to a map. As a context it commits at the end, and drops them on an exception.
+    """Adds and removes images. As a context it commits at the end; an exception drops the changes.
 
-    There is one writer of a map at a time, beside any number of readers. Images not yet committed
+    There is one writer of a map at a time, beside any number of readers. Changes not yet committed
     are in memory and lost in a crash; committed ones are on disk. A failure to write closes the
     writer. Use it in one thread.
     """
@@ -38,6 +38,7 @@ class MapWriter:
         self._metadata = metadata  # as committed
         self._num_images = metadata.num_images
         self._pose_noise = metadata.pose_noise
+        self._has_removed = False  # since the last commit
         self._scales: list[np.float32] = []  # of the last retrieval block, unless it is full
         self._rows: list[NDArray[np.int8]] = []
         self._environment: lmdb.Environment | None = _writable_environment(path, fd)
@@ -74,7 +75,9 @@ class MapWriter:
             with closing(Snapshot(path, model)) as snapshot:
                 _require_sound(path)
                 writer = cls(path, fd, snapshot.metadata)
-                writer._load_last_block(snapshot)
+                block, num_rows = divmod(len(writer), schema.BLOCK_ROWS)
+                if num_rows:
+                    writer._load_block(snapshot.get(schema.block_key(block)))
             undo.pop_all()
             return writer
 
@@ -105,6 +108,48 @@ class MapWriter:
                 self._scales, self._rows = [], []
         return index
 
+    def remove(self, name: str) -> None:
+        """Remove an image; the last one takes its index, so that there is no gap."""
+        with self._writing() as txn:
+            _require_name(name)
+            if txn.get(schema.name_key(name)) is None:
+                raise DatabaseError(f"holds no image {name!r}")
+            index = schema.decode_index(_get(txn, schema.name_key(name)))
+            last = self._num_images - 1
+            if not self._rows:
+                self._load_block(_get(txn, schema.block_key(last // schema.BLOCK_ROWS)))
+            scale, row = self._scales.pop(), self._rows.pop()
+            if index != last:
+                self._move(txn, last, index, scale, row)
+            for key in (schema.name_key(name), schema.image_key(last), schema.features_key(last)):
+                txn.delete(key)
+            if not self._rows:
+                txn.delete(schema.block_key(last // schema.BLOCK_ROWS))
+            self._num_images, self._has_removed = last, True
+
+    def _move(
+        self,
+        txn: lmdb.Transaction,
+        source: int,
+        target: int,
+        scale: np.float32,
+        row: NDArray[np.int8],
+    ) -> None:
+        """Give the image at the end, whose row has been taken off, another one's index."""
+        for key_of in (schema.image_key, schema.features_key):
+            _put(txn, key_of(target), bytes(_get(txn, key_of(source))))
+        name = schema.decode_name(_get(txn, schema.image_key(source)))
+        _put(txn, schema.name_key(name), schema.encode_index(target))
+        block, place = divmod(target, schema.BLOCK_ROWS)
+        if block == source // schema.BLOCK_ROWS:
+            self._scales[place], self._rows[place] = scale, row
+            return
+        key = schema.block_key(block)
+        scales, rows = schema.decode_block(_get(txn, key), self._metadata.model.global_dim)
+        scales, rows = scales.copy(), rows.copy()
+        scales[place], rows[place] = scale, row
+        _put(txn, key, schema.encode_block(scales, rows))
+
     def set_pose_noise(self, noise: PoseNoise | None) -> None:
         """Say how well the poses of the map agree, None if that is not known."""
         self._pose_noise = noise
@@ -112,7 +157,7 @@ class MapWriter:
     def commit(self) -> None:
         """Put what was added on disk; returns when it is there."""
         metadata = replace(self._metadata, num_images=self._num_images, pose_noise=self._pose_noise)
-        if metadata == self._metadata:
+        if metadata == self._metadata and not self._has_removed:
             return
         with self._writing() as txn:
             if self._rows:
@@ -120,7 +165,7 @@ class MapWriter:
             metadata = replace(metadata, generation=metadata.generation + 1)
             _put(txn, schema.METADATA_KEY, metadata.encode())
             txn.commit()
-            self._txn, self._metadata = None, metadata
+            self._txn, self._metadata, self._has_removed = None, metadata, False
 
     def close(self) -> None:
         """Drop what was not committed and let other writers in."""
@@ -161,16 +206,18 @@ class MapWriter:
         block = schema.encode_block(np.array(self._scales), np.array(self._rows))
         _put(txn, schema.block_key((self._num_images - 1) // schema.BLOCK_ROWS), block)
 
-    def _load_last_block(self, snapshot: Snapshot) -> None:
-        block, num_rows = divmod(self._num_images, schema.BLOCK_ROWS)
-        if num_rows:
-            payload = snapshot.get(schema.block_key(block))
-            scales, rows = schema.decode_block(payload, self._metadata.model.global_dim)
-            self._scales, self._rows = list(scales), list(rows.copy())
+    def _load_block(self, payload: memoryview) -> None:
+        scales, rows = schema.decode_block(payload, self._metadata.model.global_dim)
+        self._scales, self._rows = list(scales), list(rows.copy())
 
 
 def _put(txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
     txn.put(key, schema.seal(key, payload))
+
+
+def _get(txn: lmdb.Transaction, key: bytes) -> memoryview:
+    value = txn.get(key)
+    return schema.unseal(key, None if value is None else memoryview(value))
 
 
 def _writable_environment(path: Path, fd: int) -> lmdb.Environment:
