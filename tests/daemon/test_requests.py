@@ -26,7 +26,7 @@ from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import build_map
 from trigpoint_db.demo import CAMERA
 from trigpoint_db.importers.colmap import PosedImage, read_model
-from trigpointd.config import Config, RequestsConfig, McapConfig
+from trigpointd.config import Config, McapConfig, RequestsConfig
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.request_queue import RequestQueue
 from trigpointd.requests import Answer, Request, Responder
