@@ -53,3 +53,12 @@ def test_relative_links_lead_somewhere() -> None:
     for page in [DOCS.parent / "README.md", *DOCS.rglob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             assert target.startswith("https://") or (page.parent / target).exists(), (page, target)
+
+
+def test_the_tests_of_faults_exist() -> None:
+    tests = DOCS.parent / "tests"
+    defined = {name for path in tests.rglob("test_*.py")
+               for name in re.findall(r"def (test_\w+)", path.read_text())}  # fmt: skip
+    named = set(re.findall(r"`(test_\w+)`", (DOCS / "reliability.md").read_text()))
+    assert named
+    assert named <= defined, named - defined
