@@ -15,7 +15,7 @@ LIB = $(DESTDIR)$(PREFIX)/lib
 SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
 .PHONY: demo test check golden bench bench-models bench-localizer wheel-test clean
-.PHONY: install install-program install-units uninstall
+.PHONY: test-systemd install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
 $(READY): pyproject.toml
@@ -44,6 +44,10 @@ check: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python -m pytest
+
+# The installed service under a real systemd, in qemu.
+test-systemd: $(READY)
+	sh tests/systemd/boot.sh $(abspath $(BIN))/python
 
 # Re-record the poses that the replay tests compare with.
 golden: $(READY)
