@@ -14,7 +14,8 @@ EXTRAS ?=
 LIB = $(DESTDIR)$(PREFIX)/lib
 SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
-.PHONY: demo test test-oak test-v4l2 check golden bench bench-models bench-localizer wheel-test clean
+.PHONY: demo test test-oak test-systemd test-v4l2 check golden
+.PHONY: bench bench-models bench-localizer wheel-test clean
 .PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
@@ -48,6 +49,10 @@ check: $(READY)
 # The camera source on a real kernel's virtual camera, in qemu; about a minute.
 test-v4l2: $(READY)
 	sh tests/v4l2/boot.sh $(abspath $(BIN))/python
+
+# The installed service under a real systemd, in qemu.
+test-systemd: $(READY)
+	sh tests/systemd/boot.sh $(abspath $(BIN))/python
 
 # Re-record the poses that the replay tests compare with.
 golden: $(READY)
