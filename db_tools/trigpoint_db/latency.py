@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import zstandard
-from mcap.exceptions import McapError
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
@@ -18,19 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from trigpoint.errors import ConfigError
+from trigpoint_db.salvage import DAMAGE
 
 TOTAL = "total"
-
-# What reading bytes that are cut off or damaged raises.
-_DAMAGE = (
-    McapError,
-    zstandard.ZstdError,
-    struct.error,
-    ValueError,
-    RuntimeError,
-    MemoryError,
-    OverflowError,
-)
 
 
 def read_stage_times(log: Path) -> dict[str, list[float]]:
@@ -89,7 +76,7 @@ def _read_statuses(log: Path) -> Iterator[tuple[str, bytes]]:
             whole = _is_whole(stream)
             try:
                 yield from _statuses(stream)
-            except _DAMAGE as error:
+            except DAMAGE as error:
                 if whole:
                     detail = str(error) or type(error).__name__
                     raise ConfigError(

@@ -61,7 +61,7 @@ _READERS: dict[int, Callable[[ReadDataStream], Any]] = {
     Opcode.DATA_END: DataEnd.read,
 }
 # What mcap and its decompressors raise on bytes that are not as they should be.
-_DAMAGE = (
+DAMAGE = (
     McapError,
     zstandard.ZstdError,
     struct.error,
@@ -121,7 +121,7 @@ def _summary(data: mmap.mmap) -> list[McapRecord]:
         return []
     try:
         return list(StreamReader(BytesIO(data[start:]), skip_magic=True).records)
-    except _DAMAGE:
+    except DAMAGE:
         return []
 
 
@@ -143,7 +143,7 @@ def _read(opcode: int, content: bytes) -> list[McapRecord] | None:
         if opcode == Opcode.MESSAGE:
             return [Message.read(stream, len(content))]
         record: McapRecord = _READERS[opcode](stream)
-    except (*_DAMAGE, LookupError):
+    except (*DAMAGE, LookupError):
         return None
     if opcode == Opcode.ATTACHMENT and content[-4:] != struct.pack("<I", crc32(content[:-4])):
         return None
