@@ -6,7 +6,7 @@ import contextlib
 import json
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from trigpoint.database.reader import MapReader
@@ -22,6 +22,7 @@ from trigpointd.messages.pose import body_pose
 from trigpointd.sources.base import BadFrame, Captured
 
 _log = logging.getLogger(__name__)
+_MAX_REPORTED = 100  # of errors that differ from frame to frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,18 +57,15 @@ class Pipeline:
     ) -> None:
         self.localizer = localizer
         self.reader = reader
-        self._map_problem = ""
-        self._reported: set[str] = set()  # what is wrong with the map or a network, said once
+        self.map_problem = ""  # why the map on disk cannot be taken up
+        self._reported: set[str] = set()  # what went wrong with frames, each said once
         self._body_from_camera = body_from_camera
         self._map_frame = map_frame
 
     def process(
-        self, captured: Captured, num_dropped: int, log: Mapping[str, object] | None = None
+        self, captured: Captured, report: Callable[[Captured], Mapping[str, object]] = lambda _: {}
     ) -> Output:
-        """Localize one frame.
-
-        `num_dropped` is how many the slot has dropped so far, `log` what the log reports.
-        """
+        """Localize one frame; `report` is asked at the end for what else its status says."""
         start_s = time.perf_counter()
         frame = captured.frame
         result = self.localize(frame)
@@ -82,10 +80,9 @@ class Pipeline:
             "frame": frame.name,
             **describe(result),
             "latency_ms": round((time.perf_counter() - start_s) * 1e3, 3),
-            "num_dropped": num_dropped,
             "num_missed": captured.num_missed,
             "map_generation": self.reader.generation,
-            **(log or {}),
+            **report(captured),
         }
         return Output(captured, result, pose, json.dumps(status).encode())
 
@@ -102,22 +99,31 @@ class Pipeline:
                 _log.info("the map is now of generation %d", self.reader.generation)
         except DatabaseError as error:
             problem = str(error)
-        if problem and problem != self._map_problem:
+        if problem and problem != self.map_problem:
             _log.error("%s; going on with the map as it was", problem)
-        self._map_problem = problem
+        self.map_problem = problem
 
     def _localize(self, frame: Frame | BadFrame) -> Result | Failed:
         if isinstance(frame, BadFrame):
             return Failed("BAD_FRAME", frame.detail)
         try:
             return self.localizer.localize(frame)
-        except (DatabaseError, ModelError) as error:
-            # A damaged image of the map, or a network that fails on this frame: others may do.
-            if str(error) not in self._reported:
-                self._reported.add(str(error))
-                _log.error("%s", error)
-            reason = "BAD_MAP" if isinstance(error, DatabaseError) else "BAD_NETWORK"
-            return Failed(reason, str(error))
+        # A damaged image of the map, a network that fails on this frame: others may do.
+        except DatabaseError as error:
+            return self._failed("BAD_MAP", error)
+        except ModelError as error:
+            return self._failed("BAD_NETWORK", error)
+        except Exception as error:  # nothing that a camera shows may end the daemon
+            return self._failed("INTERNAL_ERROR", error)
+
+    def _failed(self, reason: str, error: Exception) -> Failed:
+        text = str(error)
+        if reason == "INTERNAL_ERROR":
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+        if text not in self._reported and len(self._reported) < _MAX_REPORTED:
+            self._reported.add(text)
+            _log.error("%s", text, exc_info=reason == "INTERNAL_ERROR")
+        return Failed(reason, text)
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ import logging
 import os
 import socket
 import time
+from collections.abc import Mapping
 
 PERIOD_S = 2.0
 
@@ -47,13 +48,14 @@ class Heartbeat:
         self._frame_s = time.monotonic()
         self._outcome = outcome
 
-    def beat(self, totals: object) -> None:
+    def beat(self, totals: object, problems: Mapping[str, str]) -> None:
         """Feed the watchdog and say how it goes, at most once in `period_s`."""
         now_s = time.monotonic()
         if now_s < self._due_s:
             return
         self._due_s = now_s + self.period_s
-        notify(f"WATCHDOG=1\nSTATUS={self._describe(now_s)}; {totals}")
+        parts = [self._describe(now_s), *(f"{name}: {text}" for name, text in problems.items())]
+        notify(f"WATCHDOG=1\nSTATUS={'; '.join(parts)}; {totals}")
 
     def _describe(self, now_s: float) -> str:
         if self._frame_s is None:

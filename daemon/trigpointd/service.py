@@ -6,23 +6,25 @@ import asyncio
 import contextlib
 import logging
 import signal
+import time
 from collections import Counter
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
-from trigpoint.errors import TrigpointError
 from trigpoint.output import check_output
 from trigpointd.config import Config, McapConfig, V4l2Config
 from trigpointd.latest import Latest
-from trigpointd.pipeline import Output, Pipeline
+from trigpointd.pipeline import Pipeline
 from trigpointd.reload import Reloads
 from trigpointd.request_queue import RequestQueue
 from trigpointd.requests import Responder
 from trigpointd.sd_notify import Heartbeat, notify
 from trigpointd.sinks.base import Sink
+from trigpointd.sinks.fanout import Fanout
 from trigpointd.sinks.poses import PoseFile
 from trigpointd.sinks.recorder import Recorder
 from trigpointd.sinks.rolling_log import RollingLog
@@ -54,7 +56,7 @@ def run(
     *,
     read: Callable[[], Config] | None = None,
     poses: Path | None = None,
-    extra_sinks: Sequence[Sink] = (),
+    extra_sinks: Mapping[str, Sink] = MappingProxyType({}),
 ) -> Totals:
     """Run until the recording ends or SIGTERM or SIGINT comes; everything is closed in order.
 
@@ -68,7 +70,7 @@ def run(
     with ExitStack() as stack:
         reloads = stack.enter_context(contextlib.closing(Reloads(config, read)))
         source = open_source(config)
-        sinks = list(extra_sinks)
+        sinks = dict(extra_sinks)
         first = requests = None
         if config.log is not None:
             recording = not source.live
@@ -79,8 +81,8 @@ def run(
                 required=recording,
                 about={"settings": config.model_dump_json()},
             )
-            sinks.append(Recorder(log, lossless=recording))
-            stack.callback(sinks[-1].close)
+            sinks["log"] = Recorder(log, lossless=recording)
+            stack.callback(sinks["log"].close)
         if config.zenoh is not None:
             limits = config.zenoh.requests
             responder = Responder(config, limits, reloads.pipeline)
@@ -88,12 +90,12 @@ def run(
             requests = RequestQueue(limits, responder.answer)
             zenoh = ZenohSink(config.zenoh, config.base_key, requests)
             stack.callback(zenoh.close)
-            sinks.append(zenoh)
+            sinks["zenoh"] = zenoh
             _log.info("poses go to %s/pose", config.base_key)
             first = partial(zenoh.wait_for_subscriber, config.zenoh.wait_for_subscriber_s)
         if poses is not None:
-            sinks.append(PoseFile(poses))
-            stack.callback(sinks[-1].close)
+            sinks["poses"] = PoseFile(poses)
+            stack.callback(sinks["poses"].close)
         return asyncio.run(_run_until_signal(source, reloads, sinks, first, requests))
 
 
@@ -115,7 +117,7 @@ def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
 async def _run_until_signal(
     source: Source,
     reloads: Reloads,
-    sinks: Sequence[Sink],
+    sinks: Mapping[str, Sink],
     first: First | None,
     requests: RequestQueue | None,
 ) -> Totals:
@@ -144,7 +146,7 @@ async def _run_until_signal(
 async def serve(
     source: Source,
     pipeline: Pipeline,
-    sinks: Sequence[Sink],
+    sinks: Mapping[str, Sink],
     stop: asyncio.Event,
     *,
     first: First | None = None,
@@ -163,7 +165,7 @@ async def serve(
     turn = asyncio.Lock()
     answering = None if requests is None else asyncio.create_task(requests.serve(turn))
     try:
-        await _localize(slot, pipeline, list(sinks), totals, turn, reloads)
+        await _localize(source, slot, pipeline, sinks, totals, turn, reloads)
     finally:
         if requests is not None and answering is not None:
             requests.close()
@@ -196,19 +198,21 @@ async def _cancel_on(stop: asyncio.Event, task: asyncio.Task[None]) -> None:
 
 
 async def _localize(
+    source: Source,
     slot: Latest[Captured],
     pipeline: Pipeline,
-    sinks: list[Sink],
+    sinks: Mapping[str, Sink],
     totals: Totals,
     turn: asyncio.Lock,
     reloads: Reloads | None,
 ) -> None:
+    outlets = Fanout(sinks, required=not source.live)
     heartbeat = Heartbeat()
     while True:
         if reloads is not None and reloads.is_due:
             async with turn:
                 pipeline = await asyncio.to_thread(reloads.reload)
-        heartbeat.beat(totals)
+        heartbeat.beat(totals, _problems(pipeline, outlets))
         try:
             async with asyncio.timeout(heartbeat.period_s):
                 if not await slot.wait():
@@ -218,24 +222,39 @@ async def _localize(
         async with turn:
             captured = await slot.get()
             assert captured is not None
-            output = await asyncio.to_thread(
-                pipeline.process, captured, slot.num_dropped, _log_report(sinks)
-            )
-        _publish(sinks, output)
+            report = partial(_report, source, slot, pipeline, outlets)
+            output = await asyncio.to_thread(pipeline.process, captured, report)
+        outlets.publish(output)
         totals.outcomes[output.outcome] += 1
         totals.num_dropped = slot.num_dropped
         heartbeat.frame(output.outcome)
+        if reloads is not None:
+            reloads.review(output.outcome)
 
 
-def _log_report(sinks: list[Sink]) -> dict[str, object]:
-    return next((sink.report() for sink in sinks if isinstance(sink, Recorder)), {})
+def _problems(pipeline: Pipeline, outlets: Fanout) -> dict[str, str]:
+    """Say what does not work as it should, by the part of the daemon."""
+    problems = outlets.problems
+    if pipeline.map_problem:
+        problems["map"] = pipeline.map_problem
+    return problems
 
 
-def _publish(sinks: list[Sink], output: Output) -> None:
-    """Hand an output to every sink; one that fails is left out from then on, and said so."""
-    for sink in list(sinks):
-        try:
-            sink.publish(output)
-        except TrigpointError as error:
-            _log.error("%s; going on without it", error)
-            sinks.remove(sink)
+def _report(
+    source: Source,
+    slot: Latest[Captured],
+    pipeline: Pipeline,
+    outlets: Fanout,
+    captured: Captured,
+) -> dict[str, object]:
+    """Say how the daemon is, as a frame's status is written."""
+    report: dict[str, object] = {
+        "num_dropped": slot.num_dropped,
+        "problems": _problems(pipeline, outlets),
+    }
+    if source.live:  # of a recording, the age says nothing
+        report["age_ms"] = round((time.time_ns() - captured.frame.time_ns) / 1e6, 3)
+    recorder = outlets.sinks.get("log")
+    if isinstance(recorder, Recorder):
+        report["num_unlogged"] = recorder.num_unlogged
+    return report

@@ -520,6 +520,8 @@ def test_a_source_plays_again_after_closing() -> None:
 class Statuses:
     """A sink that asks for the end after so many frames."""
 
+    problem = ""
+
     def __init__(self, count: int, stop: asyncio.Event) -> None:
         self.received: list[dict[str, Any]] = []
         self._count = count
@@ -546,7 +548,7 @@ def test_the_daemon_serves_an_oak_camera_until_it_is_told_to_stop(
         sink = Statuses(3, stop)
         pipeline = Pipeline(Localizer(model, reader), reader, Rigid3.identity(), "map")
         async with asyncio.timeout(GUARD_S):
-            await serve(source_of(device), pipeline, [sink], stop)
+            await serve(source_of(device), pipeline, {"sink": sink}, stop)
         return sink.received
 
     with MapReader.open(tmp_path / "m.tpmap", model.identity) as reader:

@@ -52,7 +52,7 @@ def captured(demo: Demo, survey: list[PosedImage]) -> Captured:
 
 
 def status(pipeline: Pipeline, captured: Captured) -> dict[str, Any]:
-    loaded: dict[str, Any] = json.loads(pipeline.process(captured, 0).status)
+    loaded: dict[str, Any] = json.loads(pipeline.process(captured).status)
     return loaded
 
 

@@ -58,7 +58,7 @@ def test_what_is_published_is_in_the_log(tmp_path: Path, disk: Disk) -> None:
         recorder.publish(numbered(i, 1000))
     recorder.close()
     assert numbers_in(tmp_path / "log.mcap") == list(range(100))
-    assert recorder.report() == {"log_problem": "", "num_unlogged": 0}
+    assert (recorder.problem, recorder.num_unlogged) == ("", 0)
 
 
 def test_a_disk_that_hangs_costs_frames_of_the_log_alone(
@@ -68,14 +68,12 @@ def test_a_disk_that_hangs_costs_frames_of_the_log_alone(
     disk.hang()
     for i in range(2 * QUEUE):
         recorder.publish(numbered(i, NUM_BYTES // 2))  # returns, though nothing is written
-    report = recorder.report()
-    assert report["log_problem"] == "the disk is too slow"
-    dropped = report["num_unlogged"]
-    assert isinstance(dropped, int)
+    assert recorder.problem == "the disk is too slow"
+    dropped = recorder.num_unlogged
     assert QUEUE - 2 < dropped <= QUEUE + 1
     disk.responds.set()
     recorder.close()
-    assert recorder.report() == {"log_problem": "", "num_unlogged": dropped}
+    assert (recorder.problem, recorder.num_unlogged) == ("", dropped)
     assert numbers_in(tmp_path / "log.mcap") == list(range(2 * QUEUE - dropped))
     assert [record.message for record in caplog.records] == [
         "the disk is too slow for the log; frames are left out of it",

@@ -421,6 +421,8 @@ class Still:
 class Recorder:
     """A sink, and a responder, that write down what was done in which order."""
 
+    problem = ""
+
     def __init__(self) -> None:
         self.done = ""
 
@@ -454,7 +456,9 @@ def test_in_a_flood_of_requests_a_frame_waits_for_one_of_them_at_most(
         flooding = threading.Thread(target=flood)
         flooding.start()
         try:
-            asyncio.run(serve(Still(200), pipeline, [recorder], asyncio.Event(), requests=queue))
+            asyncio.run(
+                serve(Still(200), pipeline, {"recorder": recorder}, asyncio.Event(), requests=queue)
+            )
         finally:
             is_over.set()
             flooding.join()

@@ -273,7 +273,8 @@ def test_each_part_of_a_log_replays_the_same_poses(demo: Demo, tmp_path: Path) -
         ]
     settings = json.loads(metadata.metadata["settings"])
     assert settings["map"] == str(demo.map)
-    assert all((s["num_unlogged"], s["log_problem"]) == (0, "") for s in statuses)
+    assert all((s["num_unlogged"], s["problems"]) == (0, {}) for s in statuses)
+    assert "age_ms" not in statuses[0]
 
 
 def test_a_part_of_a_recording_is_replayed(demo: Demo, tmp_path: Path) -> None:
@@ -310,7 +311,7 @@ def test_a_log_folder_that_vanishes_does_not_stop_the_daemon(demo: Demo, tmp_pat
         statuses = [
             json.loads(m.data) for _, _, m in reader.iter_messages(["trigpoint/test/status"])
         ]
-    assert "was deleted" in statuses[0]["log_problem"]
+    assert "was deleted" in statuses[0]["problems"]["log"]
     assert statuses[0]["num_unlogged"] > 0
     times_ns = [status["time_ns"] for status in statuses]
     assert times_ns == sorted(times_ns)

@@ -63,7 +63,7 @@ def running(camera: Camera, map_: Path, model: FeatureModel, zenoh_: ZenohConfig
 
         async def main() -> None:
             loops.append(asyncio.get_running_loop())
-            await serve(camera, pipeline, [sink], stop, requests=requests)
+            await serve(camera, pipeline, {"zenoh": sink}, stop, requests=requests)
 
         def run() -> None:
             try:

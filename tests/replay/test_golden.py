@@ -26,6 +26,8 @@ MAX_ROTATION_DEG = 0.2
 class Collector:
     """A sink that keeps what it gets."""
 
+    problem = ""
+
     def __init__(self) -> None:
         self.outputs: list[Output] = []
 
@@ -39,7 +41,7 @@ class Collector:
 def test_the_flight_gives_the_golden_poses(demo: Demo, request: pytest.FixtureRequest) -> None:
     collector = Collector()
     source = McapConfig(type="mcap", path=demo.recording)
-    totals = run(Config(map=demo.map, source=source), extra_sinks=[collector])
+    totals = run(Config(map=demo.map, source=source), extra_sinks={"collector": collector})
     assert totals.num_dropped == 0
     poses = {
         str(output.time_ns): output.result.cam_from_world

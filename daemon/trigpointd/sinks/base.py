@@ -8,10 +8,18 @@ from trigpointd.pipeline import Output
 
 
 class Sink(Protocol):
-    """Somewhere outputs go; quick, and called from one thread."""
+    """Somewhere outputs go; quick, and called from one thread.
+
+    What a sink can mend it mends by itself, and says meanwhile in `problem` why it does not work.
+    """
+
+    @property
+    def problem(self) -> str:
+        """Why outputs do not get through; empty while they do."""
+        ...
 
     def publish(self, output: Output) -> None:
-        """Take the output of one frame; a TrigpointError says that no further one can be taken."""
+        """Take the output of one frame; a TrigpointError says that this was not possible."""
         ...
 
     def close(self) -> None:

@@ -14,6 +14,8 @@ from trigpointd.pipeline import Output
 class PoseFile:
     """Writes `time_ns qw qx qy qz tx ty tz`, cam_from_world, of every localized frame."""
 
+    problem = ""
+
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file = open_text(path)

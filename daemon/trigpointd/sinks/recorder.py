@@ -44,10 +44,15 @@ class Recorder:
             self._queued_bytes += _num_bytes(output)
             self._changed.notify_all()
 
-    def report(self) -> dict[str, object]:
-        """Return what the status says of the log."""
-        problem = self._log.problem or ("the disk is too slow" if self._behind else "")
-        return {"log_problem": problem, "num_unlogged": self._num_dropped + self._log.num_unlogged}
+    @property
+    def problem(self) -> str:
+        """Why recording pauses or leaves out frames; empty while it does not."""
+        return self._log.problem or ("the disk is too slow" if self._behind else "")
+
+    @property
+    def num_unlogged(self) -> int:
+        """How many frames are not in the log so far."""
+        return self._num_dropped + self._log.num_unlogged
 
     def close(self) -> None:
         """Write what waits, and the index; a disk that hangs is left alone after `_CLOSE_S`."""
@@ -57,8 +62,8 @@ class Recorder:
         self._thread.join(None if self._lossless else _CLOSE_S)
         if self._thread.is_alive():
             _log.error("the disk is too slow to finish the log; `trigpoint-db recover` can")
-        if num_unlogged := self.report()["num_unlogged"]:
-            _log.warning("%d frames are not in the log", num_unlogged)
+        if self.num_unlogged:
+            _log.warning("%d frames are not in the log", self.num_unlogged)
 
     def _drop(self) -> None:
         self._num_dropped += 1
