@@ -108,7 +108,7 @@ class Pipeline:
 
     def _localize(self, frame: Frame | BadFrame) -> Result | Failed:
         if isinstance(frame, BadFrame):
-            return Failed("BAD_FRAME", frame.detail)
+            return Failed(frame.reason, frame.detail)
         try:
             return self.localizer.localize(frame)
         except (DatabaseError, ModelError) as error:

@@ -30,6 +30,7 @@ from trigpointd.sinks.zenoh import ZenohSink
 from trigpointd.sources.base import Captured, Source
 from trigpointd.sources.depthai import DepthaiSource
 from trigpointd.sources.mcap import McapSource
+from trigpointd.sources.supervised import SupervisedSource
 from trigpointd.sources.v4l2 import V4l2Source
 
 First = Callable[[], Coroutine[None, None, None]]
@@ -97,7 +98,7 @@ def run(
         return asyncio.run(_run_until_signal(source, reloads, sinks, first, requests))
 
 
-def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
+def open_source(config: Config) -> McapSource | SupervisedSource:
     """Open the recording; a camera is opened when frames are asked for."""
     source = config.source
     if isinstance(source, McapConfig):
@@ -109,7 +110,8 @@ def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
             end_s=source.end_s,
             loop=source.loop,
         )
-    return V4l2Source(source) if isinstance(source, V4l2Config) else DepthaiSource(source)
+    camera = V4l2Source(source) if isinstance(source, V4l2Config) else DepthaiSource(source)
+    return SupervisedSource(camera)
 
 
 async def _run_until_signal(
