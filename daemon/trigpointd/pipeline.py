@@ -105,7 +105,7 @@ class Pipeline:
 
     def _localize(self, frame: Frame | BadFrame) -> Result | Failed:
         if isinstance(frame, BadFrame):
-            return Failed("BAD_FRAME", frame.detail)
+            return Failed(frame.reason, frame.detail)
         try:
             return self.localizer.localize(frame)
         # A damaged image of the map, a network that fails on this frame: others may do.

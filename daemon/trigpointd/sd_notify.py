@@ -44,8 +44,9 @@ class Heartbeat:
         self._outcome = ""
 
     def frame(self, outcome: str) -> None:
-        """Take note of what came of a frame."""
-        self._frame_s = time.monotonic()
+        """Take note of what came of a frame, or that there is none."""
+        if outcome != "NO_FRAMES":
+            self._frame_s = time.monotonic()
         self._outcome = outcome
 
     def beat(self, totals: object, problems: Mapping[str, str]) -> None:

@@ -32,6 +32,7 @@ from trigpointd.sinks.zenoh import ZenohSink
 from trigpointd.sources.base import Captured, Source
 from trigpointd.sources.depthai import DepthaiSource
 from trigpointd.sources.mcap import McapSource
+from trigpointd.sources.supervised import SupervisedSource
 from trigpointd.sources.v4l2 import V4l2Source
 
 First = Callable[[], Coroutine[None, None, None]]
@@ -99,7 +100,7 @@ def run(
         return asyncio.run(_run_until_signal(source, reloads, sinks, first, requests))
 
 
-def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
+def open_source(config: Config) -> McapSource | SupervisedSource:
     """Open the recording; a camera is opened when frames are asked for."""
     source = config.source
     if isinstance(source, McapConfig):
@@ -111,7 +112,8 @@ def open_source(config: Config) -> McapSource | V4l2Source | DepthaiSource:
             end_s=source.end_s,
             loop=source.loop,
         )
-    return V4l2Source(source) if isinstance(source, V4l2Config) else DepthaiSource(source)
+    camera = V4l2Source(source) if isinstance(source, V4l2Config) else DepthaiSource(source)
+    return SupervisedSource(camera)
 
 
 async def _run_until_signal(
@@ -212,7 +214,7 @@ async def _localize(
         if reloads is not None and reloads.is_due:
             async with turn:
                 pipeline = await asyncio.to_thread(reloads.reload)
-        heartbeat.beat(totals, _problems(pipeline, outlets))
+        heartbeat.beat(totals, _problems(source, pipeline, outlets))
         try:
             async with asyncio.timeout(heartbeat.period_s):
                 if not await slot.wait():
@@ -232,12 +234,10 @@ async def _localize(
             reloads.review(output.outcome)
 
 
-def _problems(pipeline: Pipeline, outlets: Fanout) -> dict[str, str]:
+def _problems(source: Source, pipeline: Pipeline, outlets: Fanout) -> dict[str, str]:
     """Say what does not work as it should, by the part of the daemon."""
-    problems = outlets.problems
-    if pipeline.map_problem:
-        problems["map"] = pipeline.map_problem
-    return problems
+    problems = {"source": source.problem, "map": pipeline.map_problem, **outlets.problems}
+    return {name: problem for name, problem in problems.items() if problem}
 
 
 def _report(
@@ -250,7 +250,7 @@ def _report(
     """Say how the daemon is, as a frame's status is written."""
     report: dict[str, object] = {
         "num_dropped": slot.num_dropped,
-        "problems": _problems(pipeline, outlets),
+        "problems": _problems(source, pipeline, outlets),
     }
     if source.live:  # of a recording, the age says nothing
         report["age_ms"] = round((time.time_ns() - captured.frame.time_ns) / 1e6, 3)

@@ -406,6 +406,7 @@ class Still:
     """A camera that has a frame whenever one is wanted, and so many of them."""
 
     live = False
+    problem = ""
 
     def __init__(self, num_frames: int) -> None:
         self._num_frames = num_frames

@@ -28,6 +28,8 @@ NUM_FRAMES = 12
 class Camera:
     """Gives black frames, each after the one before has been published."""
 
+    problem = ""
+
     def __init__(self, *, live: bool = True) -> None:
         self.live = live
         self.published = asyncio.Semaphore(1)

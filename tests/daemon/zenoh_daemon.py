@@ -32,6 +32,7 @@ class Camera:
     """A live camera that shows the same picture over and over, or so many times."""
 
     live = True
+    problem = ""
 
     def __init__(self, picture: Path, num_frames: int | None = None) -> None:
         self._image = read_gray(picture)

@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trigpoint.errors import SourceError
+from trigpoint.errors import ConfigError, SourceError
 from trigpoint.frame import Frame
 from trigpointd.config import V4l2Config
 from trigpointd.sources import videodev2 as v4l2
 from trigpointd.sources.base import BadFrame, Captured
+from trigpointd.sources.supervised import SupervisedSource
 from trigpointd.sources.v4l2 import V4l2Source
 from trigpointd.sources.video_device import Kernel, Linux
 
@@ -31,6 +32,7 @@ DEVICE = Path("/dev/video0")
 TIMEOUT_S = 60
 FPS = 10
 GIVES = "camera /dev/video0: vivid (vivid) gives YUYV, 640 x 480 px at 10 fps"
+COMES = "camera /dev/video0: frames come"
 pytestmark = pytest.mark.skipif(
     not ((DRIVER / "vivid.0").exists() and os.geteuid() == 0),
     reason="needs root and the driver vivid as the only camera; run `make test-v4l2`",
@@ -74,10 +76,10 @@ def set_control(name: str, value: int = 1) -> None:
         os.close(fd)
 
 
-def make_source(kernel: Kernel | None = None, **fields: Any) -> V4l2Source:
+def make_source(kernel: Kernel | None = None, **fields: Any) -> SupervisedSource:
     camera = "PINHOLE 640 480 460 460 320 240"
     given = {"type": "v4l2", "device": DEVICE, "camera": camera, "fps": FPS, "timeout_s": 30}
-    return V4l2Source(V4l2Config.model_validate(given | fields), kernel=kernel)
+    return SupervisedSource(V4l2Source(V4l2Config.model_validate(given | fields), kernel=kernel))
 
 
 @contextlib.asynccontextmanager
@@ -161,11 +163,11 @@ def test_motion_jpeg_is_asked_for_yuyv_is_given_and_taken(log: pytest.LogCapture
             return await until(is_good)
 
     assert is_good(asyncio.run(take()))
-    assert log.messages == [f"{GIVES} (MJPG at 10 fps was asked for)"]
+    assert log.messages == [f"{GIVES} (MJPG at 10 fps was asked for)", COMES]
 
 
 def test_a_size_that_it_lacks_is_an_error() -> None:
-    with pytest.raises(SourceError, match=r"it gives 640 x \d+ px, but source.camera is for 650"):
+    with pytest.raises(ConfigError, match=r"it gives 640 x \d+ px, but source.camera is for 650"):
         make_source(camera="PINHOLE 650 490 460 460 320 240").describe()
 
 
@@ -211,11 +213,11 @@ def test_an_error_of_the_stream_is_outlived(log: pytest.LogCaptureFixture) -> No
         async with streaming() as until:
             await until(is_good)
             set_control("Inject Fatal Streaming Error")
-            await until(lambda captured: is_good(captured) and len(log.messages) == 3)
+            await until(lambda captured: is_good(captured) and len(log.messages) == 4)
 
     asyncio.run(take())
     error = "input/output error; if it stays, check the cable and the power"
-    assert log.messages == [GIVES, f"camera /dev/video0: {error}; trying again", GIVES]
+    assert log.messages == [GIVES, COMES, f"camera /dev/video0: {error}; trying again", COMES]
 
 
 def test_a_camera_that_is_unplugged_is_waited_for(log: pytest.LogCaptureFixture) -> None:
@@ -224,13 +226,13 @@ def test_a_camera_that_is_unplugged_is_waited_for(log: pytest.LogCaptureFixture)
     async def take() -> None:
         async with streaming() as until:
             await until(is_good)
-            waiting = asyncio.ensure_future(until(lambda _: len(log.messages) == 3))
+            waiting = asyncio.ensure_future(until(lambda _: len(log.messages) == 4))
             (DRIVER / "unbind").write_text("vivid.0")
-            await asyncio.to_thread(wait_for, log, 2)
+            await asyncio.to_thread(wait_for, log, 3)
             with pytest.raises(SourceError, match=absent):
                 make_source().describe()
             (DRIVER / "bind").write_text("vivid.0")
             assert is_good(await waiting)
 
     asyncio.run(take())
-    assert log.messages == [GIVES, f"camera /dev/video0: {absent}; trying again", GIVES]
+    assert log.messages == [GIVES, COMES, f"camera /dev/video0: {absent}; trying again", COMES]

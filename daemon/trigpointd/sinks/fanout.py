@@ -31,11 +31,8 @@ class Fanout:
 
     @property
     def problems(self) -> dict[str, str]:
-        """Why sinks do not do their work, by name, of those that do not."""
-        found = {
-            name: self._failures.get(name) or sink.problem for name, sink in self.sinks.items()
-        }
-        return {name: problem for name, problem in found.items() if problem}
+        """Why sinks do not do their work, by name; empty for those that do."""
+        return {name: self._failures.get(name) or sink.problem for name, sink in self.sinks.items()}
 
     def publish(self, output: Output) -> None:
         """Hand an output to every sink."""

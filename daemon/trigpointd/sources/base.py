@@ -33,11 +33,12 @@ class Message:
 
 @dataclass(frozen=True)
 class BadFrame:
-    """A frame that cannot be used; the stream goes on."""
+    """A frame that cannot be used, or that there is none; the stream goes on."""
 
     time_ns: int
     name: str
     detail: str
+    reason: str = "BAD_FRAME"
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +61,15 @@ class Source(Protocol):
     """A camera or a recording.
 
     `live` says what to do with a frame that comes while another is being localized: of a live
-    source the newest frame wins, of a recording every frame is processed.
+    source the newest frame wins, of a recording every frame is processed. `problem` says why there
+    are no frames; it is empty while they come.
 
     A frame that cannot be used is a `BadFrame`; a source that cannot go on raises a
     `SourceError`. Iterate within `contextlib.aclosing`, and close the source afterwards.
     """
 
     live: bool
+    problem: str
 
     def frames(self) -> AsyncGenerator[Captured, None]:
         """Yield frames as they come, until a recording ends or the task is cancelled."""

@@ -15,7 +15,6 @@ import numpy as np
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError, SourceError
-from trigpointd.backoff import Backoff
 from trigpointd.clock import WallClock
 from trigpointd.config import DepthaiConfig
 from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
@@ -37,12 +36,8 @@ _LENSES = {"Perspective": "rational_polynomial", "Fisheye": "fisheye"}
 _QUEUE_SIZE = 4  # frames that wait for a busy event loop
 
 
-class _CameraLostError(Exception):
-    """The camera is not there, or no longer; the text says why."""
-
-
 class DepthaiSource:
-    """One camera of an OAK device; where it is lost, it is looked for until it is back.
+    """One camera of an OAK device, which is opened with each stream of frames.
 
     Frames are stamped with the middle of their exposure, which DepthAI gives in the host's
     monotonic clock, as `WallClock` turns it into the system's time. Their intrinsics are those
@@ -55,30 +50,24 @@ class DepthaiSource:
         Which camera, and how it takes pictures.
     open_pipeline : callable, optional
         Makes the pipeline, not yet started, and its queue of frames.
-    backoff : Backoff, optional
-        The delays between tries.
     """
-
-    live = True
 
     def __init__(
         self,
         config: DepthaiConfig,
         *,
         open_pipeline: Callable[[DepthaiConfig], tuple[Any, Any]] | None = None,
-        backoff: Backoff | None = None,
     ) -> None:
+        self.name = f"camera {config.socket}"
         self._dai = _import_depthai()
         self._config = config
         self._open_pipeline = open_pipeline or open_camera
-        self._backoff = backoff or Backoff()
         self._clock = WallClock()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="depthai")
         self._pipeline: Any = None
         self._queue: Any = None
         self._calibration: Message | None = None
         self._camera: Camera | None = None
-        self._problem: str | None = None
         self._sequence: int | None = None
         self._num_missed = 0
 
@@ -87,35 +76,28 @@ class DepthaiSource:
         try:
             self._start()
             frame = self._next().frame
-        except _CameraLostError as error:
-            raise SourceError(str(error)) from error
         finally:
             self._stop()
         if isinstance(frame, BadFrame):
             raise SourceError(frame.detail)
-        return f"{self._config.socket} gives {frame.camera.width} x {frame.camera.height} px"
+        return f"it gives {frame.camera.width} x {frame.camera.height} px"
 
     async def frames(self) -> AsyncGenerator[Captured, None]:
-        """Yield frames as they come; one that cannot be used is a `BadFrame`.
+        """Open the camera and yield frames as they come; one that is of no use is a `BadFrame`.
 
         Raises
         ------
         SourceError
+            Where the camera is lost, or cannot be opened now.
+        ConfigError
             Where no other try would help: there is no such socket, or no usable calibration.
         """
-        while True:
-            try:
-                await self._in_thread(self._start)
-                while True:
-                    captured = await self._in_thread(self._next)
-                    self._report("")
-                    self._backoff.reset()
-                    yield captured
-            except _CameraLostError as error:
-                self._report(str(error))
-            finally:
-                await self.close()
-            await asyncio.sleep(self._backoff.next_s())
+        try:
+            await self._in_thread(self._start)
+            while True:
+                yield await self._in_thread(self._next)
+        finally:
+            await self.close()
 
     async def close(self) -> None:
         """Stop the camera, also while its thread waits for a frame."""
@@ -127,22 +109,12 @@ class DepthaiSource:
     async def _in_thread(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
-    def _report(self, problem: str) -> None:
-        """Say what is wrong with the camera, if anything, where that has changed."""
-        if problem == self._problem:
-            return
-        self._problem = problem
-        if problem:
-            _log.warning("%s; trying until there are frames", problem)
-        else:
-            _log.info("frames come from %s", self._config.socket)
-
     def _start(self) -> None:
         try:
             self._pipeline, self._queue = self._open_pipeline(self._config)
             self._pipeline.start()
         except RuntimeError as error:
-            raise _CameraLostError(f"the camera cannot be started: {_one_line(error)}") from error
+            raise SourceError(f"it cannot be started: {_one_line(error)}") from error
         self._sequence = None
 
     def _next(self) -> Captured:
@@ -150,9 +122,9 @@ class DepthaiSource:
         try:
             image = self._queue.get(timedelta(seconds=timeout_s))
         except (RuntimeError, self._dai.MessageQueue.QueueException) as error:
-            raise _CameraLostError("the camera was disconnected") from error
+            raise SourceError("it was disconnected") from error
         if image is None:
-            raise _CameraLostError(f"no frame from the camera in {timeout_s:g} s")
+            raise SourceError(f"no frame in {timeout_s:g} s")
         self._count(image.getSequenceNum())
         return self._capture(image)
 
@@ -224,7 +196,7 @@ def _make_pipeline(dai: Any, device: Any, config: DepthaiConfig) -> tuple[Any, A
     sensors = {sensor.socket: sensor for sensor in device.getConnectedCameraFeatures()}
     if socket not in sensors:
         names = ", ".join(sorted(other.name for other in sensors)) or "none"
-        raise SourceError(f"the device has no camera {config.socket}; it has {names}")
+        raise ConfigError(f"the device has no camera {config.socket}; it has {names}")
     pipeline = dai.Pipeline(device)
     camera = pipeline.create(dai.node.Camera).build(socket)
     set_exposure(camera.initialControl, config)
@@ -242,9 +214,9 @@ def choose_device(found: Sequence[Any], wanted: str | None) -> Any:
         if wanted in (None, info.deviceId, info.name):
             return info
     if wanted is None:
-        raise _CameraLostError("no OAK camera is connected, or none that is free")
+        raise SourceError("no OAK camera is connected, or none that is free")
     names = ", ".join(f"{info.deviceId} ({info.name})" for info in found) or "none"
-    raise _CameraLostError(f"camera {wanted} is not connected, or not free; there are: {names}")
+    raise SourceError(f"device {wanted} is not connected, or not free; there are: {names}")
 
 
 def set_exposure(control: Any, config: DepthaiConfig) -> None:
@@ -258,21 +230,24 @@ def set_exposure(control: Any, config: DepthaiConfig) -> None:
 def _camera(transformation: Any) -> Camera:
     """Return the intrinsics of a frame, of its size, crop and scale."""
     if np.array_equal(transformation.getSourceIntrinsicMatrix(), np.eye(3)):
-        raise SourceError(
+        raise ConfigError(
             "the camera was never calibrated: its frames have no intrinsics; calibrate it with "
             "Luxonis's tools, which store the result in the device"
         )
     model = transformation.getDistortionModel().name
     width, height = transformation.getSize()
-    return Calibration(
-        frame_id="",
-        width=width,
-        height=height,
-        distortion_model=_LENSES.get(model, model),
-        D=transformation.getDistortionCoefficients(),
-        K=np.ravel(transformation.getIntrinsicMatrix()).tolist(),
-        P=(),
-    ).camera()
+    try:
+        return Calibration(
+            frame_id="",
+            width=width,
+            height=height,
+            distortion_model=_LENSES.get(model, model),
+            D=transformation.getDistortionCoefficients(),
+            K=np.ravel(transformation.getIntrinsicMatrix()).tolist(),
+            P=(),
+        ).camera()
+    except SourceError as error:
+        raise ConfigError(str(error)) from error
 
 
 def _import_depthai() -> Any:

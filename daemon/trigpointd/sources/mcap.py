@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Iterator
+import contextlib
+from collections.abc import AsyncGenerator, Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from trigpointd.messages.images import (
     to_frame,
 )
 from trigpointd.sources.base import BadFrame, Captured, Channel, Message
+from trigpointd.sources.lookahead import read_ahead
 from trigpointd.sources.recording import Recording
 
 _NEVER_S = 1e9
@@ -47,6 +49,7 @@ class McapSource:
     """
 
     live = False
+    problem = ""
 
     def __init__(
         self,
@@ -87,28 +90,18 @@ class McapSource:
     async def frames(self) -> AsyncGenerator[Captured, None]:
         """Yield the frames in their recorded order; the next is decoded while one is in use."""
         loop = asyncio.get_running_loop()
-        captures = self._captures()
         start_s = first_ns = None
-        # A future rather than a task: cancelling us must not abandon a thread that still reads.
-        ahead = loop.run_in_executor(None, next, captures, None)
         try:
-            while True:
-                await asyncio.wait([ahead])
-                try:
-                    captured = ahead.result()
-                except SourceError as error:
-                    raise SourceError(f"recording {self._recording.path}: {error}") from error
-                if captured is None:
-                    return
-                ahead = loop.run_in_executor(None, next, captures, None)
-                if start_s is None or first_ns is None:
-                    start_s, first_ns = loop.time(), captured.log_time_ns
-                if self._rate is not None:
-                    due_s = start_s + (captured.log_time_ns - first_ns) * 1e-9 / self._rate
-                    await asyncio.sleep(due_s - loop.time())
-                yield captured
-        finally:
-            await asyncio.gather(ahead, return_exceptions=True)
+            async with contextlib.aclosing(read_ahead(self._captures())) as captures:
+                async for captured in captures:
+                    if start_s is None or first_ns is None:
+                        start_s, first_ns = loop.time(), captured.log_time_ns
+                    if self._rate is not None:
+                        due_s = start_s + (captured.log_time_ns - first_ns) * 1e-9 / self._rate
+                        await asyncio.sleep(due_s - loop.time())
+                    yield captured
+        except SourceError as error:
+            raise SourceError(f"recording {self._recording.path}: {error}") from error
 
     async def close(self) -> None:
         """Close the file."""
@@ -133,7 +126,7 @@ class McapSource:
         ):
             self._calibration = message
 
-    def _captures(self) -> Iterator[Captured]:
+    def _captures(self) -> Generator[Captured, None, None]:
         """Yield what is played, in a loop all of it again and again, at later times."""
         if not self._loop:
             yield from self._round()

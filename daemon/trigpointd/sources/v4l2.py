@@ -1,8 +1,8 @@
-"""Frames from a V4L2 camera, for as long as the daemon runs and whatever the camera does."""
+"""Frames from a V4L2 camera."""
 
 from __future__ import annotations
 
-import asyncio
+import contextlib
 import errno
 import logging
 import math
@@ -10,15 +10,16 @@ import os
 import select
 import time
 from collections.abc import AsyncGenerator, Generator, Iterator
+from functools import partial
 
-from trigpoint.errors import SourceError
+from trigpoint.errors import ConfigError, SourceError
 from trigpoint.frame import Frame
-from trigpointd.backoff import Backoff
 from trigpointd.clock import WallClock
 from trigpointd.config import V4l2Config
 from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
 from trigpointd.messages.images import Image, parse_calibration, to_frame
 from trigpointd.sources.base import BadFrame, Captured
+from trigpointd.sources.lookahead import read_ahead
 from trigpointd.sources.video_device import Kernel, Linux, RawFrame, VideoDevice, VideoFormat
 
 _log = logging.getLogger(__name__)
@@ -36,29 +37,23 @@ _HINTS = {
 
 
 class V4l2Source:
-    """Reads a camera; one that fails or is unplugged is opened again until it works.
+    """Reads a camera, which is opened with each stream of frames.
 
     The camera is opened, read and closed by one thread at a time, in the steps of a generator,
-    which waits for frames and between tries on a descriptor that wakes it to end.
+    which waits for frames on a descriptor that wakes it to end.
 
     Parameters
     ----------
     config : V4l2Config
         The device, its intrinsics and what it is asked for.
-    kernel : Kernel
+    kernel : Kernel, optional
         What the device is driven by.
-    backoff : Backoff, optional
-        The delays between tries.
     """
 
-    live = True
-
-    def __init__(
-        self, config: V4l2Config, *, kernel: Kernel | None = None, backoff: Backoff | None = None
-    ) -> None:
+    def __init__(self, config: V4l2Config, *, kernel: Kernel | None = None) -> None:
+        self.name = f"camera {config.device}"
         self._config = config
         self._kernel = kernel or Linux()
-        self._backoff = backoff or Backoff()
         self._clock = WallClock()
         self._calibration = calibration_message(config.camera, time.time_ns())
         # As a replay of the log reads it: an OPENCV camera without distortion becomes a PINHOLE.
@@ -67,81 +62,62 @@ class V4l2Source:
             channel.message_encoding, channel.schema_name, data
         ).camera()
         self._num_missed = 0
-        self._reported: set[int] = set()  # what is wrong with the camera, each said once
-        self._delivered = False  # ever
+        self._described = ""
 
     def describe(self) -> str:
         """Open the camera and say what it delivers."""
-        try:
-            with VideoDevice(self._config.device, self._kernel) as device:
-                return f"{self._config.device}: {self._describe(device, self._configure(device))}"
-        except (OSError, SourceError) as error:
-            raise SourceError(f"camera {self._config.device}: {_explain(error)}") from error
+        with self._open() as (device, given):
+            return self._describe(device, given)
 
     async def frames(self) -> AsyncGenerator[Captured, None]:
-        """Yield frames as the camera gives them."""
-        loop = asyncio.get_running_loop()
+        """Open the camera and yield frames as it gives them."""
         wake = os.eventfd(0)
-        captures = self._captures(wake)
-        ahead = None
+        ahead = read_ahead(self._captures(wake), stop=partial(os.eventfd_write, wake, 1))
         try:
-            while True:
-                # A future rather than a task: cancelling us must not abandon the thread.
-                ahead = loop.run_in_executor(None, next, captures, None)
-                await asyncio.wait([ahead])
-                captured = ahead.result()
-                if captured is None:
-                    return
-                yield captured
+            async with contextlib.aclosing(ahead):
+                async for captured in ahead:
+                    yield captured
         finally:
-            os.eventfd_write(wake, 1)
-            if ahead is not None:
-                await asyncio.wait([ahead])
-            captures.close()
             os.close(wake)
 
     async def close(self) -> None:
         """Nothing is held once `frames` has ended."""
 
+    @contextlib.contextmanager
+    def _open(self) -> Iterator[tuple[VideoDevice, VideoFormat]]:
+        try:
+            with VideoDevice(self._config.device, self._kernel) as device:
+                yield device, self._configure(device)
+        except OSError as error:
+            raise SourceError(_explain(error)) from error
+
     def _captures(self, wake: int) -> Generator[Captured, None, None]:
-        while True:
-            start_s = time.monotonic()
-            try:
-                with VideoDevice(self._config.device, self._kernel) as device:
-                    given = self._configure(device)
-                    device.start()
-                    yield from self._stream(device, given, wake)
-                    return
-            except OSError as error:
-                kind = errno.ENODEV if error.errno in _ABSENT else error.errno or 0
-                self._report(kind, error)
-            except SourceError as error:  # a camera that is not the one that is configured
-                if not self._delivered:
-                    raise SourceError(f"camera {self._config.device}: {error}") from error
-                self._report(0, error)
-            if time.monotonic() - start_s > self._config.timeout_s:
-                self._backoff.reset()
-            if _wait(wake, timeout_s=self._backoff.next_s()):
-                return
+        with self._open() as (device, given):
+            described = self._describe(device, given)
+            if described != self._described:
+                self._described = described
+                _log.info("%s: %s", self.name, described)
+            device.start()
+            yield from self._stream(device, given, wake)
 
     def _configure(self, device: VideoDevice) -> VideoFormat:
         """Ask for what is configured; take another format or rate, but no other size."""
         config, camera = self._config, self._camera
         given = device.configure(config.format, camera.width, camera.height, config.fps)
         if (given.width, given.height) != (camera.width, camera.height):
-            raise SourceError(
+            raise ConfigError(
                 f"it gives {given.width} x {given.height} px, but source.camera is for "
                 f"{camera.width} x {camera.height} px; give the intrinsics of a size it has"
             )
         if given.pixel_format not in _ENCODINGS:
-            raise SourceError(
+            raise ConfigError(
                 f"it gives {given.pixel_format}, which cannot be read, where {config.format} was "
                 "asked for; `v4l2-ctl --list-formats-ext` lists what source.format may be"
             )
         return given
 
     def _stream(self, device: VideoDevice, given: VideoFormat, wake: int) -> Iterator[Captured]:
-        """Yield frames until woken; a camera that gives no usable one for long is an OSError."""
+        """Yield frames until woken; a camera that gives no usable one for long is lost."""
         checks = _Checks(self._config, given, self._clock)
         timeout_s, usable_s = self._config.timeout_s, time.monotonic()
         problem = "it sends nothing"
@@ -154,14 +130,13 @@ class V4l2Source:
             if raw is not None:
                 captured = self._capture(raw, given, checks)
                 if isinstance(captured.frame, Frame):
-                    self._report_good(device, given)
                     yield captured
                     usable_s = time.monotonic()
                     continue
                 problem = captured.frame.detail
                 yield captured
             if left_s <= 0:
-                raise OSError(errno.ETIMEDOUT, f"no usable frame in {timeout_s:g} s: {problem}")
+                raise SourceError(f"no usable frame in {timeout_s:g} s: {problem}")
 
     def _capture(self, raw: RawFrame, given: VideoFormat, checks: _Checks) -> Captured:
         arrival_ns = time.time_ns()
@@ -181,19 +156,6 @@ class V4l2Source:
             image = gray_image(frame)
         message = image_message(image, arrival_ns, raw.sequence)
         return Captured(frame, arrival_ns, message, self._calibration, self._num_missed)
-
-    def _report(self, kind: int, error: OSError | SourceError) -> None:
-        """Log what is wrong, once until the camera works again."""
-        if kind not in self._reported:
-            self._reported.add(kind)
-            _log.warning("camera %s: %s; trying again", self._config.device, _explain(error))
-
-    def _report_good(self, device: VideoDevice, given: VideoFormat) -> None:
-        """Log what the camera delivers, at first and when it works again."""
-        if self._reported or not self._delivered:
-            self._reported.clear()
-            self._delivered = True
-            _log.info("camera %s: %s", self._config.device, self._describe(device, given))
 
     def _describe(self, device: VideoDevice, given: VideoFormat) -> str:
         config = self._config
@@ -251,9 +213,7 @@ def _wait(*descriptors: int, timeout_s: float) -> set[int]:
     return {descriptor for descriptor, _ in poll.poll(timeout_s * 1e3)}
 
 
-def _explain(error: OSError | SourceError) -> str:
-    if isinstance(error, SourceError):
-        return str(error)
+def _explain(error: OSError) -> str:
     if error.errno in _ABSENT:
         return "it is not there: plug it in, or name another source.device"
     return _HINTS.get(error.errno or 0, error.strerror or str(error))

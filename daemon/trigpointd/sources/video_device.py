@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from trigpoint.errors import SourceError
+from trigpoint.errors import ConfigError
 from trigpointd.sources import videodev2 as v4l2
 
 _NUM_BUFFERS = 4
@@ -94,7 +94,8 @@ class Linux:
 class VideoDevice:
     """An open device; to be used by one thread at a time, and as a context manager.
 
-    What the kernel refuses is an OSError; a device that is no camera a SourceError.
+    What the kernel refuses is an OSError; a device that is no camera, or none that can be used, a
+    ConfigError.
     """
 
     def __init__(self, path: Path, kernel: Kernel) -> None:
@@ -129,7 +130,7 @@ class VideoDevice:
         pix.pixelformat = v4l2.fourcc(pixel_format)
         self._call(v4l2.VIDIOC_S_FMT, wanted)
         if pix.field != v4l2.FIELD_NONE:
-            raise SourceError("it gives interlaced pictures; choose a progressive input")
+            raise ConfigError("it gives interlaced pictures; choose a progressive input")
         return VideoFormat(
             v4l2.fourcc_name(pix.pixelformat),
             pix.width,
@@ -186,14 +187,14 @@ class VideoDevice:
             self._call(v4l2.VIDIOC_QUERYCAP, about)
         except OSError as error:
             if error.errno in (errno.ENOTTY, errno.EINVAL):
-                raise SourceError(
+                raise ConfigError(
                     "it is not a video device; name one such as /dev/video0"
                 ) from None
             raise
         has_own = about.capabilities & v4l2.CAP_DEVICE_CAPS
         can = about.device_caps if has_own else about.capabilities
         if not (can & v4l2.CAP_VIDEO_CAPTURE and can & v4l2.CAP_STREAMING):
-            raise SourceError(
+            raise ConfigError(
                 "it is a video device but not a camera that streams by the single-planar API; "
                 "`v4l2-ctl --list-devices` lists the others"
             )
