@@ -72,6 +72,9 @@ class V4l2Config(Section):
     camera: CameraText  # intrinsics; their size is asked for
     format: Literal["YUYV", "GREY", "NV12", "MJPG"] = "YUYV"
     fps: Annotated[float, Field(gt=0, le=1000)] | None = None  # without: the driver's choice
+    exposure_ms: Annotated[float, Field(gt=0, le=10_000)] | None = None  # fixed; else automatic
+    gain: Annotated[int, Field(ge=0, lt=2**31)] | None = None  # fixed, in the driver's unit
+    keep_rate: bool = True  # in the dark too, where the exposure is automatic
     timeout_s: Annotated[float, Field(gt=0)] = 5.0  # without a usable frame: opened again
     allow_repeats: bool = False  # pictures that are the same to the byte, as simulations give
 
