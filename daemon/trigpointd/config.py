@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
 from pydantic import (
+    AwareDatetime,
     BaseModel,
     ConfigDict,
     Field,
@@ -49,6 +50,8 @@ class McapConfig(Section):
     rate: Annotated[float, Field(gt=0)] | None = None  # of the recorded pace; without: at once
     start_s: Annotated[float, Field(ge=0)] = 0.0  # since the first image
     end_s: Annotated[float, Field(gt=0)] | None = None
+    start_time: AwareDatetime | None = None  # of arrival; what is given of the four all holds
+    end_time: AwareDatetime | None = None
     loop: bool = False  # begin again at the end; times go on
 
 
