@@ -8,7 +8,6 @@ import json
 import logging
 import os
 import sys
-import threading
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -36,6 +35,7 @@ from trigpointd.pipeline import open_pipeline
 from trigpointd.service import open_source, run
 from trigpointd.sinks.log_files import LogFiles
 from trigpointd.sinks.zenoh import make_settings
+from trigpointd.sources.depthai import is_opening
 from trigpointd.watch import Received, subscribe
 
 app = typer.Typer(
@@ -71,9 +71,7 @@ def run_command(
     faulthandler.enable()  # systemd's watchdog ends a hang by SIGABRT: where it hung is then said
     totals = run(load_config(config), read=partial(load_config, config))
     logging.getLogger(__name__).info("%s", totals)
-    if any(thread.daemon for thread in threading.enumerate()):
-        # One was left in a call that cannot be interrupted. Where DepthAI was opening a camera,
-        # Python's own end crashed 16 of 36 processes. All else has ended.
+    if is_opening():  # all else has ended
         os._exit(0)
 
 
