@@ -6,6 +6,7 @@ import asyncio
 import faulthandler
 import json
 import logging
+import os
 import sys
 from contextlib import ExitStack
 from functools import partial
@@ -34,6 +35,7 @@ from trigpointd.pipeline import open_pipeline
 from trigpointd.service import open_source, run
 from trigpointd.sinks.log_files import LogFiles
 from trigpointd.sinks.zenoh import make_settings
+from trigpointd.sources.depthai import is_opening
 from trigpointd.watch import Received, subscribe
 
 app = typer.Typer(
@@ -69,6 +71,8 @@ def run_command(
     faulthandler.enable()  # systemd's watchdog ends a hang by SIGABRT: where it hung is then said
     totals = run(load_config(config), read=partial(load_config, config))
     logging.getLogger(__name__).info("%s", totals)
+    if is_opening():  # all else has ended
+        os._exit(0)
 
 
 @app.command()

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
 from pydantic import (
+    AwareDatetime,
     BaseModel,
     ConfigDict,
     Field,
@@ -49,6 +50,8 @@ class McapConfig(Section):
     rate: Annotated[float, Field(gt=0)] | None = None  # of the recorded pace; without: at once
     start_s: Annotated[float, Field(ge=0)] = 0.0  # since the first image
     end_s: Annotated[float, Field(gt=0)] | None = None
+    start_time: AwareDatetime | None = None  # of arrival; what is given of the four all holds
+    end_time: AwareDatetime | None = None
     loop: bool = False  # begin again at the end; times go on
 
 
@@ -72,6 +75,9 @@ class V4l2Config(Section):
     camera: CameraText  # intrinsics; their size is asked for
     format: Literal["YUYV", "GREY", "NV12", "MJPG"] = "YUYV"
     fps: Annotated[float, Field(gt=0, le=1000)] | None = None  # without: the driver's choice
+    exposure_ms: Annotated[float, Field(gt=0, le=10_000)] | None = None  # fixed; else automatic
+    gain: Annotated[int, Field(ge=0, lt=2**31)] | None = None  # fixed, in the driver's unit
+    keep_rate: bool = True  # in the dark too, where the exposure is automatic
     timeout_s: Annotated[float, Field(gt=0)] = 5.0  # without a usable frame: opened again
     allow_repeats: bool = False  # pictures that are the same to the byte, as simulations give
 

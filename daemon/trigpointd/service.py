@@ -110,6 +110,8 @@ def open_source(config: Config) -> McapSource | SupervisedSource:
             rate=source.rate,
             start_s=source.start_s,
             end_s=source.end_s,
+            start_time=source.start_time,
+            end_time=source.end_time,
             loop=source.loop,
         )
     camera = V4l2Source(source) if isinstance(source, V4l2Config) else DepthaiSource(source)

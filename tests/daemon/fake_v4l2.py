@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import errno
 import mmap
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +29,18 @@ class Filled:
 
 
 @dataclass
+class Knob:
+    """A control of a camera; it may be read-only, or refuse what is set with an error."""
+
+    minimum: int
+    maximum: int
+    default: int
+    flags: int = 0
+    error: OSError | None = None
+    value: int | None = None  # as it was set
+
+
+@dataclass
 class Plugged:
     """A camera that is there: what it is, and what comes of its stream before it is silent.
 
@@ -42,6 +55,7 @@ class Plugged:
     field: int = v4l2.FIELD_NONE
     fps: int | None = 30
     capabilities: int = v4l2.CAP_VIDEO_CAPTURE | v4l2.CAP_STREAMING
+    controls: Mapping[int, Knob] = dataclasses.field(default_factory=dict)
 
     @property
     def step(self) -> int:
@@ -104,6 +118,8 @@ class FakeKernel:
             self._set_format(argument.fmt.pix)
         elif isinstance(argument, v4l2.StreamParm):
             self._set_rate(request, argument.parm.capture)
+        elif isinstance(argument, v4l2.QueryControl | v4l2.Control):
+            self._handle_control(request, argument)
         elif isinstance(argument, v4l2.RequestBuffers):
             assert request == v4l2.VIDIOC_REQBUFS
             argument.count = min(argument.count, 3)
@@ -129,6 +145,22 @@ class FakeKernel:
             self.rates.append(capture.timeperframe.denominator / capture.timeperframe.numerator)
         capture.capability = v4l2.CAP_TIMEPERFRAME
         capture.timeperframe = v4l2.Fraction(1, self._camera.fps)
+
+    def _handle_control(self, request: int, argument: v4l2.QueryControl | v4l2.Control) -> None:
+        knob = self._camera.controls.get(argument.id)
+        if knob is None:
+            raise OSError(errno.EINVAL, "Invalid argument")
+        if isinstance(argument, v4l2.QueryControl):
+            assert request == v4l2.VIDIOC_QUERYCTRL
+            argument.minimum, argument.maximum = knob.minimum, knob.maximum
+            argument.default_value, argument.flags = knob.default, knob.flags
+            return
+        assert request == v4l2.VIDIOC_S_CTRL
+        assert not knob.flags & v4l2.CTRL_FLAG_READ_ONLY
+        if knob.error is not None:
+            raise knob.error
+        assert knob.minimum <= argument.value <= knob.maximum
+        knob.value = argument.value
 
     @property
     def _length(self) -> int:

@@ -1,3 +1,4 @@
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -157,3 +158,13 @@ def test_a_network_is_a_profile_or_a_file_beside_the_settings(tmp_path: Path) ->
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"cannot read .*: No such file"):
         load_config(tmp_path / "none.toml")
+
+
+def test_a_time_of_a_recording_is_one_of_tomls_and_has_a_zone(tmp_path: Path) -> None:
+    text = 'map = "m.tpmap"\n[source]\ntype = "mcap"\npath = "r.mcap"\nstart_time = '
+    source = load_config(write(tmp_path, text + "2026-11-21T10:15:00+02:00\n")).source
+    assert isinstance(source, McapConfig)
+    assert source.start_time == datetime(2026, 11, 21, 8, 15, tzinfo=UTC)
+    with pytest.raises(ConfigError, match=r"'source.start_time': .*timezone") as caught:
+        load_config(write(tmp_path, text + "2026-11-21T10:15:00\n"))
+    assert "\n" not in str(caught.value)

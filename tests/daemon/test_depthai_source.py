@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from trigpoint.database.reader import MapReader
@@ -180,6 +181,11 @@ async def take(source: SupervisedSource, count: int) -> list[Captured]:
                 break
     await source.close()
     return taken
+
+
+def child_environment() -> dict[str, str]:
+    root = Path(__file__).parents[2]
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(root), *sys.path])}
 
 
 def frames_of(device: Device, count: int) -> list[Frame]:
@@ -368,7 +374,7 @@ def test_a_camera_that_is_lost_comes_back(
     assert [record.message for record in caplog.records] == [
         "camera CAM_A: frames come",
         f"camera CAM_A: {problem}; trying again",
-        "camera CAM_A: it cannot be started: X_LINK_DEVICE_NOT_FOUND; trying again",
+        "camera CAM_A: it cannot be opened: X_LINK_DEVICE_NOT_FOUND; trying again",
         "camera CAM_A: frames come",
     ]
 
@@ -454,19 +460,100 @@ def test_closing_waits_until_depthai_has_ended() -> None:
     assert ended.is_set()
 
 
-def test_cancelling_while_it_opens_the_camera_stops_it_afterwards() -> None:
-    opening, opened = threading.Event(), threading.Event()
+class Opened:
+    """A pipeline that is also its device, and its queue; it tells what was done with it."""
 
-    class SlowDevice(Device):
-        def open(self, config: DepthaiConfig) -> tuple[Any, Any]:
-            opening.set()
-            opened.wait(GUARD_S)
-            return super().open(config)
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.closed = threading.Event()
 
-    device = SlowDevice([image(0)])
-    asyncio.run(cancel_when(opening, source_of(device), opened.set))
-    assert len(device.pipelines) == 1
-    assert not device.pipelines[0].isRunning()
+    def getDefaultDevice(self) -> Opened:
+        return self
+
+    def stop(self) -> None:
+        self.calls.append("stop")
+
+    def wait(self) -> None:
+        self.calls.append("wait")
+
+    def close(self) -> None:
+        self.closed.set()
+
+
+def test_the_end_does_not_wait_for_a_camera_that_is_being_opened_and_closes_it_afterwards() -> None:
+    opening, open_now, opened = threading.Event(), threading.Event(), Opened()
+
+    def open_slowly(config: DepthaiConfig) -> tuple[Any, Any]:
+        opening.set()
+        open_now.wait()
+        return opened, opened
+
+    camera = DepthaiSource(DepthaiConfig(type="depthai"), open_pipeline=open_slowly)
+    asyncio.run(cancel_when(opening, SupervisedSource(camera)))
+    assert not opened.closed.is_set()
+    open_now.set()
+    assert opened.closed.wait(GUARD_S)
+    assert opened.calls == ["stop", "wait"]
+
+
+def test_a_camera_that_was_opened_in_the_moment_of_the_end_is_closed() -> None:
+    opened, finished = Opened(), threading.Event()
+
+    def open_at_once(config: DepthaiConfig) -> tuple[Any, Any]:
+        finished.set()
+        return opened, opened
+
+    async def scenario() -> None:
+        camera = DepthaiSource(DepthaiConfig(type="depthai"), open_pipeline=open_at_once)
+        before = set(threading.enumerate())
+        first = asyncio.ensure_future(anext(camera.frames()))
+        await asyncio.sleep(0)
+        finished.wait()  # the loop, which would hear of it, waits as well
+        for thread in set(threading.enumerate()) - before:
+            thread.join()
+        first.cancel()
+        await asyncio.wait([first])
+
+    asyncio.run(scenario())
+    assert opened.closed.is_set()
+
+
+def test_sigterm_while_depthai_opens_a_camera_ends_the_daemon_in_order(
+    tmp_path: Path, model: FeatureModel
+) -> None:
+    with MapWriter.create(tmp_path / "m.tpmap", model.identity):
+        pass
+    # Nobody answers there; DepthAI gives up after ten seconds.
+    (tmp_path / "settings.toml").write_text(
+        'map = "m.tpmap"\n[source]\ntype = "depthai"\ndevice = "127.0.0.1"\n'
+        '[log]\npath = "log.mcap"\n'
+    )
+    settings = str(tmp_path / "settings.toml")
+    program = f"""
+import atexit, sys
+from trigpointd.cli import main
+
+atexit.register(print, "Python's own end, which crashes DepthAI", flush=True)
+sys.argv = ["trigpointd", "--verbose", "run", "--config", {settings!r}]
+main()
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", program],
+        env=child_environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as daemon:
+        assert daemon.stdout is not None
+        said = []
+        for line in daemon.stdout:
+            said.append(line.strip())
+            if line.endswith("camera CAM_A: opening 127.0.0.1\n"):
+                daemon.terminate()
+        assert daemon.wait(GUARD_S) == 0, said
+    assert said[-2:] == ["trigpointd: stopping", "trigpointd: no frames, 0 dropped"]
+    with (tmp_path / "log.mcap").open("rb") as file:
+        assert make_reader(file).get_summary() is not None
 
 
 def test_cancelling_between_two_tries_does_not_wait_for_the_next() -> None:
@@ -559,6 +646,13 @@ def test_a_device_is_chosen_by_id_or_name_or_is_the_first() -> None:
     assert choose_device(found, "10.0.0.7") is found[1]
 
 
+def test_an_address_that_was_not_found_is_tried_all_the_same() -> None:
+    chosen = choose_device([device_info("10.0.0.7", "18443010")], "10.0.9.1")
+    assert (chosen.name, chosen.protocol) == ("10.0.9.1", dai.XLinkProtocol.X_LINK_TCP_IP)
+    with pytest.raises(SourceError, match=r"device 10\.0\.9 is not connected"):
+        choose_device([], "10.0.9")
+
+
 def test_a_device_that_is_not_there_is_looked_for_and_said_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -612,11 +706,9 @@ async def main():
 
 asyncio.run(main())
 """
-    root = Path(__file__).parents[2]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), *sys.path])}
     ended = subprocess.run(
         [sys.executable, "-c", program],
-        env=environment,
+        env=child_environment(),
         capture_output=True,
         text=True,
         timeout=GUARD_S,

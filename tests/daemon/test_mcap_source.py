@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Iterable
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -607,6 +608,46 @@ def test_a_part_of_a_recording_plays(
     captured = asyncio.run(play(source))
     assert [shown(c.frame) for c in captured] == list(expected)
     assert captured[0].log_time_ns == START_NS + expected[0] * 10**8
+
+
+@pytest.mark.parametrize(
+    ("part", "expected"),
+    [
+        ({"start_time": 0.3}, range(3, 10)),
+        ({"start_time": -3600.0}, range(10)),
+        ({"start_time": 0.3, "end_time": 0.5}, range(3, 5)),
+        ({"start_time": 0.3, "start_s": 0.5}, range(5, 10)),
+        ({"end_time": 0.5, "end_s": 0.3}, range(3)),
+    ],
+)
+def test_a_part_may_be_given_as_times(
+    recording: Path, part: dict[str, float], expected: range
+) -> None:
+    start = datetime.fromtimestamp(START_NS / 1e9, timezone(timedelta(hours=2)))
+    limits: dict[str, Any] = {
+        key: start + timedelta(seconds=value) if key.endswith("time") else value
+        for key, value in part.items()
+    }
+    captured = asyncio.run(play(McapSource(recording, **limits)))
+    assert [shown(c.frame) for c in captured] == list(expected)
+
+
+@pytest.mark.parametrize(
+    ("start_h", "end_h", "complaint"),
+    [
+        (1, None, "no images from 3600 s; "),
+        (None, -1, "no images from 0 s to -3600 s; "),
+        (1, -1, "no images from 3600 s to -3600 s; "),
+    ],
+)
+def test_times_without_images_are_an_error_that_tells_when_there_were_some(
+    recording: Path, start_h: int | None, end_h: int | None, complaint: str
+) -> None:
+    first = datetime.fromtimestamp(START_NS / 1e9, UTC)
+    start, end = (None if h is None else first + timedelta(hours=h) for h in (start_h, end_h))
+    last = f"the last is at 0.900 s, {first:%Y-%m-%dT%H:%M:}"
+    with pytest.raises(SourceError, match=complaint + last):
+        McapSource(recording, start_time=start, end_time=end)
 
 
 def test_a_part_begins_with_the_calibration_then_in_force(tmp_path: Path) -> None:

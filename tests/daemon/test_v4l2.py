@@ -15,10 +15,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.daemon.fake_v4l2 import FakeKernel, Filled, Plugged
+from tests.daemon.fake_v4l2 import FakeKernel, Filled, Knob, Plugged
 from trigpoint.camera import Camera
+from trigpoint.database.reader import MapReader
+from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError, SourceError
-from trigpoint.frame import Failed, Frame
+from trigpoint.frame import Failed, Frame, LocalFeatures, Lost, Reason
+from trigpoint.localizer import Localizer
+from trigpoint.models.features import FeatureModel
+from trigpoint.rigid import Rigid3
 from trigpointd.backoff import Backoff
 from trigpointd.config import V4l2Config
 from trigpointd.pipeline import Output
@@ -115,6 +120,7 @@ def test_structures_and_ioctls_are_those_of_the_kernel() -> None:
     sizes = {
         v4l2.Capability: 104, v4l2.PixFormat: 48, v4l2.Format: 208, v4l2.StreamParm: 204,
         v4l2.CaptureParm: 40, v4l2.RequestBuffers: 20, v4l2.Timecode: 16, v4l2.Buffer: 88,
+        v4l2.QueryControl: 68, v4l2.Control: 8,
     }  # fmt: skip
     assert {kind: ctypes.sizeof(kind) for kind in sizes} == sizes
     assert v4l2.Format.fmt.offset == 8
@@ -126,6 +132,7 @@ def test_structures_and_ioctls_are_those_of_the_kernel() -> None:
         "QUERYBUF": 0xC0585609, "QBUF": 0xC058560F, "DQBUF": 0xC0585611,
         "STREAMON": 0x40045612, "STREAMOFF": 0x40045613,
         "G_PARM": 0xC0CC5615, "S_PARM": 0xC0CC5616,
+        "S_CTRL": 0xC008561C, "QUERYCTRL": 0xC0445624,
     }  # fmt: skip
     assert {name: getattr(v4l2, f"VIDIOC_{name}") for name in numbers} == numbers
     assert v4l2.fourcc("YUYV") == 0x56595559
@@ -280,6 +287,36 @@ def test_a_frozen_picture_is_not_taken_for_a_new_one() -> None:
     assert details(take_all(*stream, allow_repeats=True)) == [""] * 4
 
 
+def one_keypoint(model: FeatureModel) -> LocalFeatures:
+    descriptor, place = (
+        np.eye(1, dim, dtype=np.float32)
+        for dim in (model.identity.descriptor_dim, model.identity.global_dim)
+    )
+    scores = np.ones(1, np.float32)
+    return LocalFeatures(np.ones((1, 2), np.float32), descriptor, scores, place[0])
+
+
+@pytest.mark.parametrize("level", [0, 255])
+@pytest.mark.parametrize("pixel_format", ["GREY", "MJPG"])
+def test_behind_a_covered_lens_all_pictures_are_alike_and_the_camera_is_not_frozen(
+    pixel_format: str, level: int, model: FeatureModel, tmp_path: Path
+) -> None:
+    blank = np.full((HEIGHT, WIDTH), level, np.uint8)
+    blank[1, 1] ^= 1  # a pixel that is always on
+    data = blank.tobytes() if pixel_format == "GREY" else bytes(cv2.imencode(".jpg", blank)[1])
+    camera = Plugged([Filled(data, i) for i in range(3)], pixel_format)
+    captures = take(FakeKernel(camera), 3, format=pixel_format)
+    assert details(captures) == ["", "", ""]
+    with MapWriter.create(tmp_path / "m.tpmap", model.identity) as writer:
+        writer.add("anchor", Camera.from_text(CAMERA), Rigid3.identity(), one_keypoint(model))
+    with MapReader.open(tmp_path / "m.tpmap", model.identity) as reader:
+        for captured in captures:
+            assert isinstance(captured.frame, Frame)
+            result = Localizer(model, reader).localize(captured.frame)
+            assert isinstance(result, Lost)
+            assert result.reason == Reason.TOO_DARK
+
+
 def test_gaps_in_the_sequence_are_counted_over_all_streams() -> None:
     streams = ([0, 1, 4, 5, 7], [3, 5], [2**32 - 2, 0, 1], [9, 9, 4])
     plugged = (Plugged([*map(filled, numbers), EIO]) for numbers in streams)
@@ -313,6 +350,86 @@ def test_another_format_or_rate_is_taken_and_said(log: pytest.LogCaptureFixture)
 def test_a_driver_that_knows_no_rate_is_taken(log: pytest.LogCaptureFixture) -> None:
     assert details(take(FakeKernel(Plugged([filled(0)], fps=None)), 1)) == [""]
     assert log.messages[0] == "camera /dev/video7: Fake Camera (fake) gives YUYV, 8 x 4 px"
+
+
+MODE, EXPOSURE = v4l2.CID_EXPOSURE_AUTO, v4l2.CID_EXPOSURE_ABSOLUTE
+PRIORITY = v4l2.CID_EXPOSURE_AUTO_PRIORITY
+GAIN, AUTOGAIN = v4l2.CID_GAIN, v4l2.CID_AUTOGAIN
+
+
+def knobs() -> dict[int, Knob]:
+    """The controls of a webcam."""
+    return {
+        MODE: Knob(0, 3, 3),
+        EXPOSURE: Knob(3, 2047, 250),
+        PRIORITY: Knob(0, 1, 0),
+        GAIN: Knob(0, 100, 20),
+        AUTOGAIN: Knob(0, 1, 1),
+    }
+
+
+@pytest.mark.parametrize(
+    ("settings", "values"),
+    [
+        ({}, {MODE: 3, PRIORITY: 0, AUTOGAIN: 1}),
+        ({"keep_rate": False}, {MODE: 3, PRIORITY: 1, AUTOGAIN: 1}),
+        ({"exposure_ms": 4.26}, {MODE: 1, EXPOSURE: 43, PRIORITY: 0, AUTOGAIN: 1}),
+        ({"exposure_ms": 0.3, "gain": 0},
+         {MODE: 1, EXPOSURE: 3, PRIORITY: 0, AUTOGAIN: 0, GAIN: 0}),
+    ],
+)  # fmt: skip
+def test_exposure_and_gain_are_fixed_or_left_to_the_camera(
+    settings: dict[str, Any], values: dict[int, int]
+) -> None:
+    controls = knobs()
+    assert details(take(FakeKernel(Plugged([filled(0)], controls=controls)), 1, **settings)) == [""]
+    found = {number: knob.value for number, knob in controls.items()}
+    assert {number: value for number, value in found.items() if value is not None} == values
+
+
+def test_what_nobody_asked_for_may_be_lacking_fixed_or_refused() -> None:
+    controls = {
+        MODE: Knob(0, 3, 3, flags=v4l2.CTRL_FLAG_READ_ONLY),
+        PRIORITY: Knob(0, 1, 0, error=EIO),
+    }
+    assert details(take(FakeKernel(Plugged([filled(0)], controls=controls)), 1)) == [""]
+
+
+DENIED = OSError(errno.EACCES, "Permission denied")
+
+
+@pytest.mark.parametrize(
+    ("changes", "settings", "message"),
+    [
+        ({EXPOSURE: None}, {"exposure_ms": 4}, "it has no control for source.exposure_ms; leave"),
+        ({GAIN: None}, {"gain": 4}, "it has no control for source.gain; leave that out"),
+        ({GAIN: Knob(0, 9, 0, flags=v4l2.CTRL_FLAG_DISABLED)}, {"gain": 4},
+         "it has no control for source.gain; leave that out"),
+        ({}, {"exposure_ms": 500}, "it takes a source.exposure_ms of 0.3 to 204.7, not of 500"),
+        ({}, {"exposure_ms": 0.01}, "it takes a source.exposure_ms of 0.3 to 204.7, not of 0.01"),
+        ({}, {"gain": 101}, "it takes a source.gain of 0 to 100, not of 101"),
+        ({EXPOSURE: Knob(3, 2047, 250, error=DENIED)}, {"exposure_ms": 4},
+         r"it does not take source.exposure_ms = 4 \(Permission denied\); leave that out"),
+    ],
+)  # fmt: skip
+def test_an_exposure_or_gain_that_the_camera_cannot_take_ends_the_start(
+    changes: dict[int, Knob | None], settings: dict[str, Any], message: str
+) -> None:
+    controls = {number: knob for number, knob in (knobs() | changes).items() if knob is not None}
+    kernel = FakeKernel(Plugged([filled(0)], controls=controls))
+    with pytest.raises(ConfigError, match=f"^camera /dev/video7: {message}") as caught:
+        take(kernel, 1, **settings)
+    assert "\n" not in str(caught.value)
+    assert not kernel.open_descriptors
+
+
+def test_a_camera_that_fails_while_it_is_set_up_is_tried_again(
+    log: pytest.LogCaptureFixture,
+) -> None:
+    failing = knobs() | {GAIN: Knob(0, 100, 20, error=EIO)}
+    kernel = FakeKernel(Plugged(controls=failing), Plugged([filled(0)], controls=knobs()))
+    assert details(take(kernel, 1, gain=7)) == [""]
+    assert "input/output error" in log.messages[0]
 
 
 WRONG = [

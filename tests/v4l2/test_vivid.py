@@ -39,39 +39,29 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-class QueryControl(ctypes.Structure):
-    """struct v4l2_queryctrl."""
-
-    _fields_ = (
-        ("id", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("name", ctypes.c_char * 32),
-        ("numbers", ctypes.c_int32 * 4),
-        ("flags", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32 * 2),
-    )
-
-
-class Control(ctypes.Structure):
-    """struct v4l2_control."""
-
-    _fields_ = (("id", ctypes.c_uint32), ("value", ctypes.c_int32))
-
-
-VIDIOC_S_CTRL = 0xC008561C
-VIDIOC_QUERYCTRL = 0xC0445624
 CTRL_FLAG_NEXT_CTRL = 0x80000000
+VIDIOC_G_CTRL = 0xC008561B
+
+
+def get_control(number: int) -> int:
+    fd = os.open(DEVICE, os.O_RDWR)
+    try:
+        control = v4l2.Control(number)
+        fcntl.ioctl(fd, VIDIOC_G_CTRL, control)
+        return int(control.value)
+    finally:
+        os.close(fd)
 
 
 def set_control(name: str, value: int = 1) -> None:
     """Set a control of the driver, such as press a button that breaks something."""
     fd = os.open(DEVICE, os.O_RDWR)
     try:
-        query = QueryControl()
+        query = v4l2.QueryControl()
         while query.name.decode() != name:
             query.id |= CTRL_FLAG_NEXT_CTRL
-            fcntl.ioctl(fd, VIDIOC_QUERYCTRL, query)
-        fcntl.ioctl(fd, VIDIOC_S_CTRL, Control(query.id, value))
+            fcntl.ioctl(fd, v4l2.VIDIOC_QUERYCTRL, query)
+        fcntl.ioctl(fd, v4l2.VIDIOC_S_CTRL, v4l2.Control(query.id, value))
     finally:
         os.close(fd)
 
@@ -169,6 +159,20 @@ def test_motion_jpeg_is_asked_for_yuyv_is_given_and_taken(log: pytest.LogCapture
 def test_a_size_that_it_lacks_is_an_error() -> None:
     with pytest.raises(ConfigError, match=r"it gives 640 x \d+ px, but source.camera is for 650"):
         make_source(camera="PINHOLE 650 490 460 460 320 240").describe()
+
+
+def test_a_gain_is_fixed_and_given_back_to_the_camera() -> None:
+    make_source(gain=31).describe()
+    assert (get_control(v4l2.CID_AUTOGAIN), get_control(v4l2.CID_GAIN)) == (0, 31)
+    make_source().describe()
+    assert get_control(v4l2.CID_AUTOGAIN) == 1
+
+
+def test_a_gain_out_of_range_or_an_exposure_that_it_lacks_is_an_error() -> None:
+    with pytest.raises(ConfigError, match=r"it takes a source\.gain of 0 to 255, not of 256"):
+        make_source(gain=256).describe()
+    with pytest.raises(ConfigError, match=r"it has no control for source\.exposure_ms"):
+        make_source(exposure_ms=5).describe()
 
 
 def test_a_frame_that_is_marked_as_damaged_is_bad_and_the_next_is_good() -> None:

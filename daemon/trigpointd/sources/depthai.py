@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import ipaddress
 import logging
 import os
+import threading
 import time
-from collections.abc import AsyncGenerator, Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import AsyncGenerator, Callable, Generator, Sequence
+from concurrent.futures import Future
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +23,9 @@ from trigpointd.config import DepthaiConfig
 from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
 from trigpointd.messages.images import Calibration, Image, to_frame
 from trigpointd.sources.base import BadFrame, Captured, Message
+from trigpointd.sources.lookahead import read_ahead
 
 _log = logging.getLogger(__name__)
-T = TypeVar("T")
 # DepthAI's names of pixel formats and lens models, and ROS's, which the rest of the daemon uses.
 _ENCODINGS = {
     "GRAY8": "mono8",
@@ -33,6 +36,7 @@ _ENCODINGS = {
     "RGB888i": "rgb8",
 }
 _LENSES = {"Perspective": "rational_polynomial", "Fisheye": "fisheye"}
+_OPENER = "depthai-opener"
 _QUEUE_SIZE = 4  # frames that wait for a busy event loop
 
 
@@ -41,8 +45,7 @@ class DepthaiSource:
 
     Frames are stamped with the middle of their exposure, which DepthAI gives in the host's
     monotonic clock, as `WallClock` turns it into the system's time. Their intrinsics are those
-    that come with each of them, of the size and crop it has. DepthAI is called from one thread
-    alone, except to close the queue that this thread waits for.
+    that come with each of them, of the size and crop it has.
 
     Parameters
     ----------
@@ -63,9 +66,6 @@ class DepthaiSource:
         self._config = config
         self._open_pipeline = open_pipeline or open_camera
         self._clock = WallClock()
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="depthai")
-        self._pipeline: Any = None
-        self._queue: Any = None
         self._calibration: Message | None = None
         self._camera: Camera | None = None
         self._sequence: int | None = None
@@ -73,11 +73,8 @@ class DepthaiSource:
 
     def describe(self) -> str:
         """Take a frame and say what it is."""
-        try:
-            self._start()
-            frame = self._next().frame
-        finally:
-            self._stop()
+        with contextlib.closing(self._captures(*self._open())) as captures:
+            frame = next(captures).frame
         if isinstance(frame, BadFrame):
             raise SourceError(frame.detail)
         return f"it gives {frame.camera.width} x {frame.camera.height} px"
@@ -92,41 +89,56 @@ class DepthaiSource:
         ConfigError
             Where no other try would help: there is no such socket, or no usable calibration.
         """
+        opening: Future[tuple[Any, Any]] = Future()
+        opening.set_running_or_notify_cancel()  # it cannot be cancelled
+        # Opening may take twelve seconds and cannot be interrupted, only left to itself.
+        threading.Thread(target=self._open_into, args=(opening,), name=_OPENER, daemon=True).start()
         try:
-            await self._in_thread(self._start)
-            while True:
-                yield await self._in_thread(self._next)
-        finally:
-            await self.close()
+            pipeline, queue = await asyncio.wrap_future(opening)
+        except asyncio.CancelledError:
+            opening.add_done_callback(_discard)
+            raise
+        ahead = read_ahead(self._captures(pipeline, queue), stop=queue.close)
+        async with contextlib.aclosing(ahead):
+            async for captured in ahead:
+                yield captured
 
     async def close(self) -> None:
-        """Stop the camera, also while its thread waits for a frame."""
-        queue = self._queue
-        if queue is not None:
-            queue.close()
-        await self._in_thread(self._stop)
+        """Nothing is held once `frames` has ended."""
 
-    async def _in_thread(self, function: Callable[[], T]) -> T:
-        return await asyncio.get_running_loop().run_in_executor(self._thread, function)
-
-    def _start(self) -> None:
+    def _open_into(self, opening: Future[tuple[Any, Any]]) -> None:
         try:
-            self._pipeline, self._queue = self._open_pipeline(self._config)
-            self._pipeline.start()
-        except RuntimeError as error:
-            raise SourceError(f"it cannot be started: {_one_line(error)}") from error
-        self._sequence = None
+            opening.set_result(self._open())
+        except BaseException as error:
+            opening.set_exception(error)
 
-    def _next(self) -> Captured:
+    def _open(self) -> tuple[Any, Any]:
+        _log.debug("%s: opening %s", self.name, self._config.device or "the first device")
+        try:
+            return self._open_pipeline(self._config)
+        except RuntimeError as error:
+            raise SourceError(f"it cannot be opened: {_one_line(error)}") from error
+
+    def _captures(self, pipeline: Any, queue: Any) -> Generator[Captured, None, None]:
+        self._sequence = None
+        try:
+            pipeline.start()
+            while True:
+                yield self._capture(self._next(queue))
+        except RuntimeError as error:
+            raise SourceError(f"it failed: {_one_line(error)}") from error
+        finally:
+            _stop(pipeline)
+
+    def _next(self, queue: Any) -> Any:
         timeout_s = self._config.timeout_s
         try:
-            image = self._queue.get(timedelta(seconds=timeout_s))
+            image = queue.get(timedelta(seconds=timeout_s))
         except (RuntimeError, self._dai.MessageQueue.QueueException) as error:
             raise SourceError("it was disconnected") from error
         if image is None:
             raise SourceError(f"no frame in {timeout_s:g} s")
-        self._count(image.getSequenceNum())
-        return self._capture(image)
+        return image
 
     def _count(self, sequence: int) -> None:
         if self._sequence is not None and sequence > self._sequence + 1:
@@ -137,6 +149,7 @@ class DepthaiSource:
 
     def _capture(self, image: Any) -> Captured:
         arrival_ns, sequence = time.time_ns(), image.getSequenceNum()
+        self._count(sequence)
         name = f"{self._config.socket}#{sequence}"
         middle = image.getTimestamp(self._dai.CameraExposureOffset.MIDDLE)
         time_ns = self._clock.time_ns(middle // timedelta(microseconds=1) * 1000)
@@ -161,18 +174,13 @@ class DepthaiSource:
         message = image_message(gray_image(frame), arrival_ns, sequence)
         return Captured(frame, arrival_ns, message, self._calibration, self._num_missed)
 
-    def _stop(self) -> None:
-        pipeline, self._pipeline, self._queue = self._pipeline, None, None
-        if pipeline is None:
-            return
-        device = pipeline.getDefaultDevice()
-        try:
-            pipeline.stop()
-            pipeline.wait()  # without it the process may crash at its exit
-            if device is not None:
-                device.close()
-        except RuntimeError as error:
-            _log.debug("the camera did not stop in order: %s", _one_line(error))
+
+def is_opening() -> bool:
+    """Whether a thread still opens a camera: Python's own end would then crash the process.
+
+    It did 16 of 36 times, by SIGABRT or SIGSEGV; `os._exit` does not.
+    """
+    return any(thread.name == _OPENER for thread in threading.enumerate())
 
 
 def open_camera(config: DepthaiConfig) -> tuple[Any, Any]:
@@ -209,14 +217,24 @@ def _make_pipeline(dai: Any, device: Any, config: DepthaiConfig) -> tuple[Any, A
 
 
 def choose_device(found: Sequence[Any], wanted: str | None) -> Any:
-    """Return the device of an id, USB port or IP address, or the first."""
+    """Return the device of an id, USB port or IP address, or the first that was found."""
     for info in found:
         if wanted in (None, info.deviceId, info.name):
             return info
     if wanted is None:
         raise SourceError("no OAK camera is connected, or none that is free")
+    if _is_address(wanted):  # looking finds cameras of the same subnet alone
+        return _import_depthai().DeviceInfo(wanted)
     names = ", ".join(f"{info.deviceId} ({info.name})" for info in found) or "none"
     raise SourceError(f"device {wanted} is not connected, or not free; there are: {names}")
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.IPv4Address(text)  # DepthAI knows no others
+    except ValueError:
+        return False
+    return True
 
 
 def set_exposure(control: Any, config: DepthaiConfig) -> None:
@@ -225,6 +243,24 @@ def set_exposure(control: Any, config: DepthaiConfig) -> None:
         control.setManualExposure(timedelta(milliseconds=config.exposure_ms), config.iso)
     elif config.max_exposure_ms is not None:
         control.setAutoExposureLimit(timedelta(milliseconds=config.max_exposure_ms))
+
+
+def _discard(opening: Future[tuple[Any, Any]]) -> None:
+    """Close a camera that nobody waits for any more."""
+    if opening.exception() is None:
+        pipeline, _ = opening.result()
+        _stop(pipeline)
+
+
+def _stop(pipeline: Any) -> None:
+    device = pipeline.getDefaultDevice()
+    try:
+        pipeline.stop()
+        pipeline.wait()  # without it the process may crash at its exit
+        if device is not None:
+            device.close()
+    except RuntimeError as error:
+        _log.debug("the camera did not stop in order: %s", _one_line(error))
 
 
 def _camera(transformation: Any) -> Camera:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, Generator, Iterator
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from trigpoint.camera import Camera
@@ -24,6 +25,7 @@ from trigpointd.sources.base import BadFrame, Captured, Channel, Message
 from trigpointd.sources.lookahead import read_ahead
 from trigpointd.sources.recording import Recording
 
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _NEVER_S = 1e9
 _ONLY_FRAME_NS = 10**8  # how long a recording of a single frame lasts, in a loop
 
@@ -42,6 +44,8 @@ class McapSource:
     start_s, end_s : float
         Which part to play, in seconds since the first image, by the times of arrival; the end,
         which is not played any more, is that of the recording by default.
+    start_time, end_time : datetime, optional
+        The same as times of arrival, with their time zone; where both kinds are given, both hold.
     loop : bool
         Whether to begin again at the end. All times then go on from where they were, so that they
         rise: what comes in the second round is stamped as if the recording went on at its mean
@@ -59,6 +63,8 @@ class McapSource:
         rate: float | None = None,
         start_s: float = 0.0,
         end_s: float | None = None,
+        start_time: datetime | None = None,
+        end_time: datetime | None = None,
         loop: bool = False,
     ) -> None:
         if rate is not None and not rate > 0:
@@ -77,7 +83,7 @@ class McapSource:
             self._rectified = is_rectified(self._image_topic)
             self._calibration = _choose_calibration(self._recording, self._image_topic)
             self._camera(self._calibration)
-            self._choose_part(start_s, end_s)
+            self._choose_part(start_s, end_s, start_time, end_time)
         except SourceError as error:
             self._recording.close()
             raise SourceError(f"recording {path}: {error}") from error
@@ -107,20 +113,35 @@ class McapSource:
         """Close the file."""
         self._recording.close()
 
-    def _choose_part(self, start_s: float, end_s: float) -> None:
+    def _choose_part(
+        self, start_s: float, end_s: float, start_time: datetime | None, end_time: datetime | None
+    ) -> None:
         """Set the times of arrival between which to play, and the calibration at the start."""
         topic, first = self._image_topic, self._recording.first(self._image_topic)
         assert first is not None  # else the topic would not have been chosen
-        self._start_ns = first.log_time_ns + round(start_s * 1e9)
-        self._end_ns = first.log_time_ns + round(end_s * 1e9)
-        if start_s == 0:
+        first_ns = first.log_time_ns
+        self._start_ns = first_ns + round(start_s * 1e9)
+        self._end_ns = first_ns + round(end_s * 1e9)
+        if start_time is not None:
+            self._start_ns = max(self._start_ns, _time_ns(start_time))
+        if end_time is not None:
+            self._end_ns = min(self._end_ns, _time_ns(end_time))
+        if self._start_ns == first_ns < self._end_ns:
             self._start_ns = 0  # with calibrations before the first image
             return
-        if self._recording.first(topic, self._start_ns, self._end_ns) is None:
-            last = max(message.log_time_ns for message in self._recording.messages([topic]))
+        if (
+            self._start_ns >= self._end_ns
+            or self._recording.first(topic, self._start_ns, self._end_ns) is None
+        ):
+            last_ns = max(message.log_time_ns for message in self._recording.messages([topic]))
+            start_s, end_s, last_s = (
+                (time_ns - first_ns) / 1e9 for time_ns in (self._start_ns, self._end_ns, last_ns)
+            )
             end = "" if end_s == _NEVER_S else f" to {end_s:g} s"
-            last_s = (last - first.log_time_ns) / 1e9
-            raise SourceError(f"no images from {start_s:g} s{end}; the last is at {last_s:.3f} s")
+            raise SourceError(
+                f"no images from {start_s:g} s{end}; the last is at {last_s:.3f} s, "
+                f"{datetime.fromtimestamp(last_ns / 1e9, UTC):%Y-%m-%dT%H:%M:%SZ}"
+            )
         for message in self._recording.messages(
             [self._calibration.channel.topic], end_ns=self._start_ns
         ):
@@ -166,6 +187,10 @@ class McapSource:
     def _camera(self, calibration: Message) -> Camera:
         parsed = parse_calibration(*_type(calibration.channel), calibration.data)
         return parsed.camera(rectified=self._rectified)
+
+
+def _time_ns(time: datetime) -> int:
+    return (time - _EPOCH) // timedelta(microseconds=1) * 1000
 
 
 def _shifted(captured: Captured, shift_ns: int) -> Captured:

@@ -12,13 +12,17 @@ import time
 from collections.abc import AsyncGenerator, Generator, Iterator
 from functools import partial
 
+import cv2
+
 from trigpoint.errors import ConfigError, SourceError
 from trigpoint.frame import Frame
+from trigpoint.localizer import MIN_CONTRAST
 from trigpointd.clock import WallClock
 from trigpointd.config import V4l2Config
 from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
 from trigpointd.messages.images import Image, parse_calibration, to_frame
 from trigpointd.sources.base import BadFrame, Captured
+from trigpointd.sources.exposure import set_exposure
 from trigpointd.sources.lookahead import read_ahead
 from trigpointd.sources.video_device import Kernel, Linux, RawFrame, VideoDevice, VideoFormat
 
@@ -114,6 +118,7 @@ class V4l2Source:
                 f"it gives {given.pixel_format}, which cannot be read, where {config.format} was "
                 "asked for; `v4l2-ctl --list-formats-ext` lists what source.format may be"
             )
+        set_exposure(device, config)
         return given
 
     def _stream(self, device: VideoDevice, given: VideoFormat, wake: int) -> Iterator[Captured]:
@@ -149,6 +154,7 @@ class V4l2Source:
                 time_ns, "camera", raw.data, encoding, given.width, given.height, given.step
             )
             frame = to_frame(image, self._camera, time_ns, name)
+            checks.check_new(raw, frame)
         except SourceError as error:
             bad = BadFrame(arrival_ns, name, str(error))
             return Captured(bad, arrival_ns, num_missed=self._num_missed)
@@ -187,10 +193,9 @@ class _Checks:
         return missed if missed < 2**31 else 0  # else a driver that counts anew, or not at all
 
     def time_ns(self, raw: RawFrame) -> int:
-        """Return the time of capture; a frame that says nothing new, or not when, is an error."""
+        """Return the time of capture; a frame that is damaged, or of no known time, is an error."""
         now_ns = time.monotonic_ns()
         stamp_ns = now_ns if raw.monotonic_ns is None else raw.monotonic_ns
-        data, self._data = self._data, raw.data
         if raw.damaged:
             raise SourceError("the driver marks the frame as damaged")
         if not now_ns - _MAX_AGE_NS <= stamp_ns <= now_ns + self._max_ahead_ns:
@@ -200,9 +205,15 @@ class _Checks:
             behind_s = (self._newest_ns - stamp_ns) / 1e9
             raise SourceError(f"the frame's time stamp is {behind_s:.3f} s before an earlier one's")
         self._newest_ns = stamp_ns
-        if raw.data == data and not self._allow_repeats:
-            raise SourceError("the picture is the one before, byte for byte: the camera is frozen")
         return self._clock.time_ns(stamp_ns)
+
+    def check_new(self, raw: RawFrame, frame: Frame) -> None:
+        """Refuse a picture that is the one before; behind a covered lens all are the same."""
+        data, self._data = self._data, raw.data
+        if self._allow_repeats or raw.data != data:
+            return
+        if cv2.meanStdDev(frame.image)[1].item() >= MIN_CONTRAST:  # else it is TOO_DARK
+            raise SourceError("the picture is the one before, byte for byte: the camera is frozen")
 
 
 def _wait(*descriptors: int, timeout_s: float) -> set[int]:

@@ -139,6 +139,22 @@ class VideoDevice:
             self._set_rate(fps),
         )
 
+    def control(self, number: int) -> v4l2.QueryControl | None:
+        """Return what a control takes, None where the device has none that can be set."""
+        control = v4l2.QueryControl(id=number)
+        try:
+            self._call(v4l2.VIDIOC_QUERYCTRL, control)
+        except OSError as error:
+            if error.errno in (errno.ENOTTY, errno.EINVAL):
+                return None
+            raise
+        fixed = control.flags & (v4l2.CTRL_FLAG_DISABLED | v4l2.CTRL_FLAG_READ_ONLY)
+        return None if fixed else control
+
+    def set_control(self, number: int, value: int) -> None:
+        """Set a control."""
+        self._call(v4l2.VIDIOC_S_CTRL, v4l2.Control(number, value))
+
     def start(self) -> None:
         """Map buffers, give them to the driver and let frames come."""
         request = v4l2.RequestBuffers(

@@ -21,6 +21,15 @@ BUF_FLAG_ERROR = 0x40
 BUF_FLAG_TIMESTAMP_MASK = 0xE000
 BUF_FLAG_TIMESTAMP_MONOTONIC = 0x2000
 
+CID_AUTOGAIN = 0x0098_0912
+CID_GAIN = 0x0098_0913
+CID_EXPOSURE_AUTO = 0x009A_0901
+CID_EXPOSURE_ABSOLUTE = 0x009A_0902  # in 0.1 ms
+CID_EXPOSURE_AUTO_PRIORITY = 0x009A_0903  # whether the rate may fall for longer exposures
+EXPOSURE_MANUAL = 1
+CTRL_FLAG_DISABLED = 0x1
+CTRL_FLAG_READ_ONLY = 0x4
+
 
 class Capability(ctypes.Structure):
     """struct v4l2_capability."""
@@ -151,6 +160,28 @@ class Buffer(ctypes.Structure):
     )
 
 
+class QueryControl(ctypes.Structure):
+    """struct v4l2_queryctrl."""
+
+    _fields_ = (
+        ("id", c_uint32),
+        ("type", c_uint32),
+        ("name", c_char * 32),
+        ("minimum", c_int32),
+        ("maximum", c_int32),
+        ("step", c_int32),
+        ("default_value", c_int32),
+        ("flags", c_uint32),
+        ("reserved", c_uint32 * 2),
+    )
+
+
+class Control(ctypes.Structure):
+    """struct v4l2_control."""
+
+    _fields_ = (("id", c_uint32), ("value", c_int32))
+
+
 _WRITE, _READ = 1, 2
 
 
@@ -168,6 +199,8 @@ VIDIOC_STREAMON = _ioctl(_WRITE, 18, c_int)
 VIDIOC_STREAMOFF = _ioctl(_WRITE, 19, c_int)
 VIDIOC_G_PARM = _ioctl(_READ | _WRITE, 21, StreamParm)
 VIDIOC_S_PARM = _ioctl(_READ | _WRITE, 22, StreamParm)
+VIDIOC_S_CTRL = _ioctl(_READ | _WRITE, 28, Control)
+VIDIOC_QUERYCTRL = _ioctl(_READ | _WRITE, 36, QueryControl)
 
 
 def fourcc(name: str) -> int:
