@@ -88,7 +88,7 @@ def run(
             requests = RequestQueue(limits, responder.answer)
             zenoh = ZenohSink(config.zenoh, config.base_key, requests)
             stack.callback(zenoh.close)
-            sinks.append(zenoh)
+            sinks.insert(0, zenoh)  # poses go out before the log has its work with them
             _log.info("poses go to %s/pose", config.base_key)
             first = partial(zenoh.wait_for_subscriber, config.zenoh.wait_for_subscriber_s)
         if poses is not None:
@@ -218,13 +218,17 @@ async def _localize(
         async with turn:
             captured = await slot.get()
             assert captured is not None
-            output = await asyncio.to_thread(
-                pipeline.process, captured, slot.num_dropped, _log_report(sinks)
-            )
-        _publish(sinks, output)
+            # Published by the same thread: to wake another one takes longer than to publish.
+            output = await asyncio.to_thread(_process, pipeline, captured, slot.num_dropped, sinks)
         totals.outcomes[output.outcome] += 1
         totals.num_dropped = slot.num_dropped
         heartbeat.frame(output.outcome)
+
+
+def _process(pipeline: Pipeline, captured: Captured, num_dropped: int, sinks: list[Sink]) -> Output:
+    output = pipeline.process(captured, num_dropped, _log_report(sinks))
+    _publish(sinks, output)
+    return output
 
 
 def _log_report(sinks: list[Sink]) -> dict[str, object]:
