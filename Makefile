@@ -11,11 +11,13 @@ PHOTOGRAPHS := ../shared/train_images/images
 # `make install`, docs/install.md: packages set DESTDIR and PREFIX=/usr; EXTRAS=oak for OAK cameras.
 PREFIX ?= /usr/local
 EXTRAS ?=
+# `make soak`.
+SECONDS ?= 600
 LIB = $(DESTDIR)$(PREFIX)/lib
 SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
 .PHONY: demo test test-oak test-systemd test-v4l2 check golden
-.PHONY: bench bench-models bench-localizer wheel-test clean
+.PHONY: bench bench-models bench-localizer bench-daemon soak wheel-test clean
 .PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
@@ -89,6 +91,18 @@ bench-localizer: $(READY)
 	$(BIN)/python -m benchmarks.localizer $(DATA) \
 	  $(if $(HLOC),--hloc '$(HLOC)') $(if $(EDGEPOINT2),--edgepoint2 '$(EDGEPOINT2)') \
 	  --output build/bench/localizer.md --picture build/bench/reliability.png
+
+# What the daemon adds to the localizer's time, from a camera to a subscriber; about 8 minutes.
+bench-daemon: $(READY) $(DEMO)/map.tpmap
+	@mkdir -p build/bench
+	$(BIN)/python -m benchmarks.daemon.overhead $(DEMO) --output build/bench/daemon.md
+
+# Whether memory and latency stay flat: make soak SECONDS=86400
+soak: $(READY) $(DEMO)/map.tpmap
+	$(BIN)/python -m benchmarks.daemon.soak $(DEMO) build/soak --seconds $(SECONDS)
+
+$(DEMO)/map.tpmap: | $(READY)
+	$(BIN)/trigpoint-db demo $(DEMO)
 
 # The suite against the installed wheel, not the checkout.
 wheel-test: $(READY)

@@ -21,5 +21,6 @@ shared=$(cd .. && pwd)/shared
 test ! -d "$shared" || ln -sfn "$shared" "$work/shared"
 cd "$work/run"
 ../venv/bin/python -c 'import trigpoint; assert "site-packages" in trigpoint.__file__, trigpoint'
-# The code that trains is in no wheel.
-exec ../venv/bin/python -m pytest -o pythonpath=. -p no:cacheprovider --ignore tests/training
+# The code that trains, or measures, is in no wheel.
+exec ../venv/bin/python -m pytest -o pythonpath=. -p no:cacheprovider \
+  --ignore tests/training --ignore tests/benchmarks

@@ -21,6 +21,8 @@ from trigpointd.messages.cdr import encode_pose
 from trigpointd.messages.pose import body_pose
 from trigpointd.sources.base import BadFrame, Captured
 
+Report = Callable[[Captured], Mapping[str, object]]
+
 _log = logging.getLogger(__name__)
 _MAX_REPORTED = 100  # of errors that differ from frame to frame
 
@@ -62,9 +64,7 @@ class Pipeline:
         self._body_from_camera = body_from_camera
         self._map_frame = map_frame
 
-    def process(
-        self, captured: Captured, report: Callable[[Captured], Mapping[str, object]] = lambda _: {}
-    ) -> Output:
+    def process(self, captured: Captured, report: Report = lambda _: {}) -> Output:
         """Localize one frame; `report` is asked at the end for what else its status says."""
         start_s = time.perf_counter()
         frame = captured.frame

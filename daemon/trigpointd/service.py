@@ -18,7 +18,7 @@ from types import MappingProxyType
 from trigpoint.output import check_output
 from trigpointd.config import Config, McapConfig, V4l2Config
 from trigpointd.latest import Latest
-from trigpointd.pipeline import Pipeline
+from trigpointd.pipeline import Output, Pipeline, Report
 from trigpointd.reload import Reloads
 from trigpointd.request_queue import RequestQueue
 from trigpointd.requests import Responder
@@ -91,7 +91,7 @@ def run(
             requests = RequestQueue(limits, responder.answer)
             zenoh = ZenohSink(config.zenoh, config.base_key, requests)
             stack.callback(zenoh.close)
-            sinks["zenoh"] = zenoh
+            sinks = {"zenoh": zenoh, **sinks}  # poses go out before the log has its work with them
             _log.info("poses go to %s/pose", config.base_key)
             first = partial(zenoh.wait_for_subscriber, config.zenoh.wait_for_subscriber_s)
         if poses is not None:
@@ -227,13 +227,19 @@ async def _localize(
             captured = await slot.get()
             assert captured is not None
             report = partial(_report, source, slot, pipeline, outlets)
-            output = await asyncio.to_thread(pipeline.process, captured, report)
-        outlets.publish(output)
+            # Published by the same thread: to wake another one takes longer than to publish.
+            output = await asyncio.to_thread(_process, pipeline, captured, report, outlets)
         totals.outcomes[output.outcome] += 1
         totals.num_dropped = slot.num_dropped
         heartbeat.frame(output.outcome)
         if reloads is not None:
             reloads.review(output.outcome)
+
+
+def _process(pipeline: Pipeline, captured: Captured, report: Report, outlets: Fanout) -> Output:
+    output = pipeline.process(captured, report)
+    outlets.publish(output)
+    return output
 
 
 def _problems(source: Source, pipeline: Pipeline, outlets: Fanout) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -228,8 +228,8 @@ def describe(result: Result | Failed) -> dict[str, Any]:
     """Say in JSON's types what came of a frame."""
     if isinstance(result, Failed):
         return {"status": "FAILED", "reason": result.reason, "detail": result.detail}
-    statistics = asdict(result.statistics)
-    statistics["stage_ms"] = {k: round(v, 3) for k, v in statistics["stage_ms"].items()}
+    stage_ms = {k: round(v, 3) for k, v in result.statistics.stage_ms.items()}
+    statistics = {**vars(result.statistics), "stage_ms": stage_ms}
     if isinstance(result, Lost):
         return {"status": "LOST", "reason": result.reason, "detail": result.detail, **statistics}
     return {

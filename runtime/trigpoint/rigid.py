@@ -119,7 +119,7 @@ def quaternion_from_rotation(R: Array) -> Array:
         [r02 - r20, r01 + r10, r11 - r00 - r22, r12 + r21],
         [r10 - r01, r02 + r20, r12 + r21, r22 - r00 - r11],
     ]
-    N = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    N = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
     q: Array = np.linalg.eigh(N)[1][..., -1]
     return np.where(q[..., :1] < 0, -q, q)
 

@@ -8,7 +8,7 @@ from trigpointd.pipeline import Output
 
 
 class Sink(Protocol):
-    """Somewhere outputs go; quick, and called from one thread.
+    """Somewhere outputs go; quick, and called from one thread at a time.
 
     What a sink can mend it mends by itself, and says meanwhile in `problem` why it does not work.
     """

@@ -151,6 +151,8 @@ class MapReader:
         """
         old = self._current
         with reporting(self._path):
+            if old.is_newest(self._path):
+                return False
             new = Snapshot(self._path, old.metadata.model)
         if (new.file, new.metadata.generation) == (old.file, old.metadata.generation):
             new.close()

@@ -162,12 +162,20 @@ class Snapshot:
         """
         if self._is_kept:
             return
-        newest = max(read_meta(self._fd, slot).commit for slot in (0, 1))
-        if newest > self._txn.id() + 1:
+        if self._newest_commit() > self._txn.id() + 1:
             raise DatabaseError(
                 "has changed twice since this snapshot, and nothing kept that, as no lock file "
                 "can be made beside the map; refresh the reader"
             )
+
+    def is_newest(self, path: Path) -> bool:
+        """Whether the path still leads to this file, and no commit has followed."""
+        status = path.stat()
+        same_file = (status.st_dev, status.st_ino) == self.file
+        return same_file and self._newest_commit() == self._txn.id()
+
+    def _newest_commit(self) -> int:
+        return max(read_meta(self._fd, slot).commit for slot in (0, 1))
 
     def close(self) -> None:
         """Let the snapshot go; views of it are invalid from here on."""
