@@ -175,10 +175,10 @@ class RollingLog:
     def _pausing(self) -> Iterator[None]:
         try:
             yield
-        except TrigpointError as error:
+        except Exception as error:  # a mistake of ours, too, must not end the thread
             self._pause(error)
 
-    def _pause(self, error: TrigpointError) -> None:
+    def _pause(self, error: Exception) -> None:
         if self._part is not None:
             with contextlib.suppress(SourceError):
                 self._part.close()
@@ -188,7 +188,10 @@ class RollingLog:
         if self.problem:
             self._delay_s = min(2 * self._delay_s, _MAX_DELAY_S)
         else:
-            _log.error("recording pauses: %s; it goes on as soon as it can", error)
+            unexpected = None if isinstance(error, TrigpointError) else error
+            _log.error(
+                "recording pauses: %s; it goes on as soon as it can", error, exc_info=unexpected
+            )
             self._delay_s = _FIRST_DELAY_S
-        self.problem = str(error)
+        self.problem = str(error) or type(error).__name__
         self._retry_s = self._clock() + self._delay_s
