@@ -191,6 +191,7 @@ class LogConfig(Section):
 
     path: Path  # in the file's name %Y, %m, %d, %H, %M, %S stand for the time of its start
     frames: bool = True  # input images too, so that the log can be replayed
+    visuals: bool = True  # keypoints, anchors, path, for Foxglove
     overwrite: bool = False
     max_part_mb: Annotated[float, Field(ge=1)] | None = None  # then comes another part; off
     max_part_s: Annotated[float, Field(ge=1)] | None = None  # the same

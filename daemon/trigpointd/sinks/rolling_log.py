@@ -11,6 +11,7 @@ from pathlib import Path
 from trigpoint.errors import ConfigError, SourceError, TrigpointError
 from trigpoint.output import check_output
 from trigpointd.config import LogConfig
+from trigpointd.messages.visuals import Visuals
 from trigpointd.pipeline import Output
 from trigpointd.sinks.log_files import LogFiles
 from trigpointd.sinks.mcap import McapLog
@@ -65,6 +66,7 @@ class RollingLog:
         self.num_unlogged = 0
         self._config, self._base_key, self._about, self._clock = config, base_key, about, clock
         self._files = LogFiles(config.path)
+        self._visuals = Visuals(base_key) if config.visuals else None
         self._part: McapLog | None = None
         self._last_path: Path | None = None
         self._num_unflushed = 0
@@ -93,7 +95,7 @@ class RollingLog:
         self._num_unflushed += 1
         with self._pausing():
             part = self._part or self._begin(self._files.next_part())
-            part.publish(output)
+            part.publish(output, self._visuals.draw(output) if self._visuals else ())
             if self.problem or self.time_to_flush_s == 0:
                 self._flush(part)
             if self._is_full(part):
