@@ -220,6 +220,13 @@ class LogConfig(Section):
         return self.max_part_mb is not None or self.max_part_s is not None
 
 
+class FoxgloveConfig(Section):
+    """A live view; it needs the extra `foxglove`."""
+
+    host: str = "127.0.0.1"  # that viewers connect to
+    port: Annotated[int, Field(ge=1, le=65_535)] = 8765
+
+
 class Config(Section):
     """All settings of `trigpointd run`."""
 
@@ -232,6 +239,7 @@ class Config(Section):
     localizer: LocalizerOptions = LocalizerOptions()
     zenoh: ZenohConfig | None = None  # without the table nothing is published
     log: LogConfig | None = None
+    foxglove: FoxgloveConfig | None = None  # without the table there is no live view
 
 
 def load_config(path: Path) -> Config:

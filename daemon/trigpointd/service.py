@@ -23,6 +23,7 @@ from trigpointd.request_queue import RequestQueue
 from trigpointd.requests import Responder
 from trigpointd.sd_notify import Heartbeat, notify
 from trigpointd.sinks.base import Sink
+from trigpointd.sinks.foxglove import FoxgloveSink
 from trigpointd.sinks.poses import PoseFile
 from trigpointd.sinks.recorder import Recorder
 from trigpointd.sinks.rolling_log import RollingLog
@@ -91,6 +92,9 @@ def run(
             sinks.append(zenoh)
             _log.info("poses go to %s/pose", config.base_key)
             first = partial(zenoh.wait_for_subscriber, config.zenoh.wait_for_subscriber_s)
+        if config.foxglove is not None:
+            sinks.append(FoxgloveSink(config.foxglove, config.base_key))
+            stack.callback(sinks[-1].close)
         if poses is not None:
             sinks.append(PoseFile(poses))
             stack.callback(sinks[-1].close)
