@@ -8,7 +8,7 @@ DATA := ../shared/data
 KITCHEN := $(DATA)/7scenes_redkitchen
 # Everyday pictures without poses, a tenth of which no training sees.
 PHOTOGRAPHS := ../shared/train_images/images
-# `make install`, docs/install.md: packages set DESTDIR and PREFIX=/usr; EXTRAS=oak for OAK cameras.
+# `make install`, docs/install.md: packages set DESTDIR and PREFIX=/usr; EXTRAS=oak,foxglove (pyproject.toml).
 PREFIX ?= /usr/local
 EXTRAS ?=
 # `make soak`.

@@ -34,6 +34,7 @@ from trigpointd.config import (
 from trigpointd.pipeline import open_pipeline
 from trigpointd.service import open_source, run
 from trigpointd.session import load_settings, make_settings, set_endpoints
+from trigpointd.sinks.foxglove import import_sdk
 from trigpointd.sinks.log_files import LogFiles
 from trigpointd.sources.depthai import is_opening
 from trigpointd.watch import Received, subscribe
@@ -83,6 +84,8 @@ def check_config(config: Annotated[Path, typer.Argument(help="Settings, a TOML f
         make_settings(settings.zenoh)
     if settings.log is not None:
         check_output(LogFiles(settings.log.path).unnumbered())
+    if settings.foxglove is not None:
+        import_sdk()
     with open_pipeline(settings):
         source = open_source(settings)
         print(source.describe())
