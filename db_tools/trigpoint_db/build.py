@@ -14,7 +14,7 @@ from trigpoint.errors import ConfigError, DatabaseError
 from trigpoint.frame import Frame
 from trigpoint.images import read_gray
 from trigpoint.models.features import FeatureModel
-from trigpoint_db.importers.colmap import PosedImage
+from trigpoint_db.importers.base import PosedImage
 
 COMMIT_EVERY = 100  # images; until then they are in memory
 
@@ -25,7 +25,7 @@ def select_images(images: Sequence[PosedImage], names: Sequence[str]) -> list[Po
     unknown = [name for name in names if name not in by_name]
     if unknown:
         raise ConfigError(
-            f"{len(unknown)} of {len(names)} listed images are not in the COLMAP model, "
+            f"{len(unknown)} of {len(names)} listed images are not among those with a pose, "
             f"such as {unknown[0]!r}"
         )
     return [by_name[name] for name in names]

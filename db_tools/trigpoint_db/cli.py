@@ -36,6 +36,7 @@ from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths
 from trigpoint_db.importers.colmap import read_model
+from trigpoint_db.importers.registry import IMPORTERS, read_dataset
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import localize_images
 from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
@@ -55,6 +56,15 @@ Model = Annotated[str, typer.Option(help="The network: tiny, base, large, or a f
 Retrieval = Annotated[
     Path | None, typer.Option(help="A retrieval network, where the other needs one beside it.")
 ]
+Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="A data set's folder or file.")]
+Format = Annotated[
+    str | None,
+    typer.Option("--format", help=f"One of {', '.join(IMPORTERS)}; found out by default."),
+]
+Images = Annotated[
+    Path | None, typer.Option(help="Folder of the images, where it is not the format's own.")
+]
+Poses = Annotated[Path | None, typer.Option(help="Poses that the format keeps elsewhere.")]
 MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="A .tpmap file.")]
 
 
@@ -74,8 +84,10 @@ def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
 @app.command()
 def build(
     map_: MapPath,
-    colmap: Annotated[Path, typer.Option(help="Folder of a COLMAP model, text or binary.")],
-    images: Annotated[Path, typer.Option(help="Folder of the images.")],
+    source: Source,
+    format_: Format = None,
+    images: Images = None,
+    poses: Poses = None,
     list_: Annotated[Path | None, typer.Option("--list", help="Only these names.")] = None,
     append: Annotated[bool, typer.Option("--append", help="Add to a map.")] = False,
     keypoints: Annotated[int, typer.Option(help="At most so many an image.", min=50)] = 1024,
@@ -84,17 +96,18 @@ def build(
     as_json: Json = False,
 ) -> None:
     """Make a map from images with known poses."""
-    posed = read_model(colmap)
+    dataset = read_dataset(source, format_, images=images, poses=poses)
+    posed = dataset.mapped
     if list_ is not None:
         posed = select_images(posed, read_names(list_))
     if not posed:
-        raise ConfigError(f"there are no images to map: {list_ or colmap} names none")
+        raise ConfigError(f"there are no images to map: {list_ or source} names none")
     check_output(map_)
-    check_files((image.name for image in posed), images)
+    check_files((image.name for image in posed), dataset.images)
     write = append_map if append else build_map
     network = FeatureModel.load(model, retrieval=retrieval)
     count = write(
-        map_, track(posed, "mapping", len(posed)), images, network, max_keypoints=keypoints
+        map_, track(posed, "mapping", len(posed)), dataset.images, network, max_keypoints=keypoints
     )
     noise = calibrate_map(map_, network, track_calibration)
     size = map_.stat().st_size

@@ -15,7 +15,7 @@ from trigpoint.errors import ConfigError
 from trigpoint.frame import Frame
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import read_frame
-from trigpoint_db.importers.colmap import PosedImage
+from trigpoint_db.importers.base import PosedImage
 from trigpoint_db.synthetic import World, look_at, make_room, render, render_depth, survey_poses
 
 Array = NDArray[np.float64]
