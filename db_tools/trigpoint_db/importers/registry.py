@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from trigpoint.errors import ConfigError
-from trigpoint_db.importers import colmap
+from trigpoint_db.importers import aachen, cambridge, colmap, hloc, robotcar, seven_scenes
 from trigpoint_db.importers.base import Dataset
 
 
@@ -25,6 +25,11 @@ class Importer(Protocol):
 
 IMPORTERS: dict[str, Importer] = {
     "colmap": colmap,
+    "hloc": hloc,
+    "7scenes": seven_scenes,
+    "cambridge": cambridge,
+    "aachen": aachen,
+    "robotcar": robotcar,
 }
 
 
