@@ -29,17 +29,20 @@ class PosedImage:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Images to map and images to localize; names are relative to the folder `images`.
+    """Images to map and images to localize, all of them in `images`.
+
+    That is a folder, and names are relative to it, or a recording as `read_frame` takes it.
 
     Cameras have the pixel convention of `trigpoint.camera`; poses are cam_from_world with x to the
     right, y down, z ahead, in the unit of the data set. `truth` has the poses of those queries that
-    have a public one.
+    have a public one. `num_unposed` images are in neither: their poses are not known.
     """
 
     images: Path
     mapped: list[PosedImage]
     queries: list[Query] = field(default_factory=list)
     truth: dict[str, Rigid3] = field(default_factory=dict)
+    num_unposed: int = 0
 
     @classmethod
     def from_split(

@@ -8,7 +8,18 @@ from pathlib import Path
 from typing import Protocol
 
 from trigpoint.errors import ConfigError
-from trigpoint_db.importers import aachen, cambridge, colmap, hloc, robotcar, seven_scenes
+from trigpoint_db.importers import (
+    aachen,
+    cambridge,
+    colmap,
+    euroc,
+    hloc,
+    kapture,
+    robotcar,
+    seven_scenes,
+    transforms,
+    tum,
+)
 from trigpoint_db.importers.base import Dataset
 
 
@@ -30,6 +41,10 @@ IMPORTERS: dict[str, Importer] = {
     "cambridge": cambridge,
     "aachen": aachen,
     "robotcar": robotcar,
+    "tum": tum,
+    "euroc": euroc,
+    "transforms": transforms,
+    "kapture": kapture,
 }
 
 
@@ -45,7 +60,9 @@ def read_dataset(root: Path, name: str | None = None, **options: object) -> Data
     read = IMPORTERS[name].read
     given = {option: value for option, value in options.items() if value is not None}
     for option in given.keys() - inspect.signature(read).parameters.keys():
-        raise ConfigError(f"the format {name} has no use for --{option}; leave it out")
+        raise ConfigError(
+            f"the format {name} has no use for --{option.replace('_', '-')}; leave it out"
+        )
     return read(root, **given)
 
 
