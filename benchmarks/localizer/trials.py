@@ -210,7 +210,7 @@ def real_place(folder: Path, network: FeatureModel, scratch: Path) -> Place:
     calibrate_map(path, network)
     frames = [
         (
-            read_frame(folder / "images" / query.name, query.camera, query.name),
+            read_frame(folder / "images", query.name, query.camera),
             poses[query.name].cam_from_world,
         )
         for query in read_queries(folder / "queries.txt")

@@ -88,6 +88,24 @@ def build(
     format_: Format = None,
     images: Images = None,
     poses: Poses = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Of tum: its name, or 'MODEL width height params...'.")
+    ] = None,
+    image_topic: Annotated[
+        str | None, typer.Option(help="Of mcap: one of several cameras.")
+    ] = None,
+    pose_topic: Annotated[str | None, typer.Option(help="Of mcap: one of several sources.")] = None,
+    mount: Annotated[
+        str | None,
+        typer.Option(
+            metavar="'X Y Z QW QX QY QZ'|FRAME",
+            help="Of mcap: where the camera sits on what the poses are of, or the frame of that.",
+        ),
+    ] = None,
+    max_gap: Annotated[
+        float | None,
+        typer.Option(help="Of tum, euroc, mcap: seconds between two poses, at most.", min=0),
+    ] = None,
     list_: Annotated[Path | None, typer.Option("--list", help="Only these names.")] = None,
     append: Annotated[bool, typer.Option("--append", help="Add to a map.")] = False,
     keypoints: Annotated[int, typer.Option(help="At most so many an image.", min=50)] = 1024,
@@ -96,7 +114,17 @@ def build(
     as_json: Json = False,
 ) -> None:
     """Make a map from images with known poses."""
-    dataset = read_dataset(source, format_, images=images, poses=poses)
+    dataset = read_dataset(
+        source,
+        format_,
+        images=images,
+        poses=poses,
+        camera=camera,
+        image_topic=image_topic,
+        pose_topic=pose_topic,
+        mount=mount,
+        max_gap=max_gap,
+    )
     posed = dataset.mapped
     if list_ is not None:
         posed = select_images(posed, read_names(list_))
@@ -113,9 +141,13 @@ def build(
     size = map_.stat().st_size
     if as_json:
         facts = {"map": str(map_), "num_images_added": count, "bytes": size}
+        facts["num_unposed"] = dataset.num_unposed
         print(json.dumps(facts | {"pose_noise": noise and asdict(noise)}))
     else:
-        print(f"{map_}: {count} images added, {size / 1e6:.1f} MB; {describe_noise(noise)}")
+        unposed = f", {dataset.num_unposed} without a pose left out" * bool(dataset.num_unposed)
+        print(
+            f"{map_}: {count} images added{unposed}, {size / 1e6:.1f} MB; {describe_noise(noise)}"
+        )
 
 
 @app.command()

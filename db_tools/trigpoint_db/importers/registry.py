@@ -15,6 +15,7 @@ from trigpoint_db.importers import (
     euroc,
     hloc,
     kapture,
+    mcap,
     robotcar,
     seven_scenes,
     transforms,
@@ -45,6 +46,7 @@ IMPORTERS: dict[str, Importer] = {
     "euroc": euroc,
     "transforms": transforms,
     "kapture": kapture,
+    "mcap": mcap,
 }
 
 

@@ -118,7 +118,7 @@ def survey_pairs(
     used = sorted({int(i) for k in drawn for i in (a[k], b[k])})
     views = {
         i: View(
-            read_frame(folder / posed[i].name, posed[i].camera, posed[i].name),
+            read_frame(folder, posed[i].name, posed[i].camera),
             posed[i].cam_from_world,
         )
         for i in used
