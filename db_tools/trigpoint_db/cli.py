@@ -35,8 +35,10 @@ from trigpoint_db.build import append_map, build_map, check_files, select_images
 from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths
+from trigpoint_db.importers import cli as importers_cli
+from trigpoint_db.importers.cli import Format, Images, Json, Poses, Source
 from trigpoint_db.importers.colmap import read_model
-from trigpoint_db.importers.registry import IMPORTERS, read_dataset
+from trigpoint_db.importers.registry import read_dataset
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import localize_images
 from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
@@ -50,21 +52,12 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(importers_cli.app)
 console = Console()
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 Model = Annotated[str, typer.Option(help="The network: tiny, base, large, or a file (.onnx).")]
 Retrieval = Annotated[
     Path | None, typer.Option(help="A retrieval network, where the other needs one beside it.")
 ]
-Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="A data set's folder or file.")]
-Format = Annotated[
-    str | None,
-    typer.Option("--format", help=f"One of {', '.join(IMPORTERS)}; found out by default."),
-]
-Images = Annotated[
-    Path | None, typer.Option(help="Folder of the images, where it is not the format's own.")
-]
-Poses = Annotated[Path | None, typer.Option(help="Poses that the format keeps elsewhere.")]
 MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="A .tpmap file.")]
 
 
