@@ -61,4 +61,20 @@ PUBLIC_SETS = (
         "3D-models/, intrinsics/, and every zip file of images/ unpacked in images/",
         "trigpoint-db build oxford.tpmap RobotCar-Seasons",
     ),
+    PublicSet(
+        "tum",
+        "TUM RGB-D: offices and a hall, a Kinect and motion capture (Sturm et al., IROS 2012)",
+        "https://cvg.cit.tum.de/data/datasets/rgbd-dataset",
+        "on that page",
+        "tar xf rgbd_dataset_freiburg1_desk.tgz",
+        "trigpoint-db build desk.tpmap rgbd_dataset_freiburg1_desk",
+    ),
+    PublicSet(
+        "euroc",
+        "EuRoC MAV: a drone in rooms and a machine hall (Burri et al., IJRR 2016)",
+        "https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets",
+        "on that page",
+        "unzip V1_01_easy.zip in a folder V1_01_easy",
+        "trigpoint-db build vicon.tpmap V1_01_easy",
+    ),
 )
