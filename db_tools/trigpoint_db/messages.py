@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from mcap.reader import SeekingReader
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoderFactory
 from mcap_ros2.decoder import DecoderFactory as RosDecoderFactory
 from numpy.typing import NDArray
 
 from trigpoint.camera_messages import Calibration, Image
-from trigpoint.errors import SourceError
+from trigpoint.errors import SourceError, TrigpointError
 from trigpoint_db.salvage import DAMAGE
 
+T = TypeVar("T")
 RAW_IMAGES = ("foxglove.RawImage", "sensor_msgs/msg/Image")
 IMAGES = ("foxglove.CompressedImage", "sensor_msgs/msg/CompressedImage", *RAW_IMAGES)
 CALIBRATIONS = ("foxglove.CameraCalibration", "sensor_msgs/msg/CameraInfo")
+_SCHEMA_ENCODINGS = ("protobuf", "ros2msg")
 _NS = 10**9
 
 
@@ -51,8 +52,11 @@ class Recording:
                 if path.stat().st_size == 0:  # which cannot be mapped
                     raise SourceError(f"{path} is empty")
                 data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-            decoders = (ProtobufDecoderFactory(), RosDecoderFactory())
-            self._reader = SeekingReader(data, decoder_factories=decoders)  # type: ignore[arg-type]
+            self._reader = SeekingReader(
+                data,  # type: ignore[arg-type]
+                validate_crcs=True,
+                decoder_factories=(ProtobufDecoderFactory(), RosDecoderFactory()),
+            )
             summary = self._reader.get_summary()
         except OSError as error:
             raise SourceError(f"cannot read {path}: {error.strerror}") from error
@@ -60,29 +64,39 @@ class Recording:
             raise _damage(path, error) from error
         if summary is None or not summary.chunk_indexes:
             raise SourceError(f"{path} has no index; `trigpoint-db recover` writes one with it")
-        self.topics = sorted(
+        statistics = summary.statistics
+        self._schemas = sorted(
             {
-                (channel.topic, summary.schemas[channel.schema_id].name)
+                (channel.topic, schema.name)
                 for channel in summary.channels.values()
-                if channel.schema_id in summary.schemas
+                if (schema := summary.schemas.get(channel.schema_id)) is not None
+                and schema.encoding in _SCHEMA_ENCODINGS
+                and (statistics is None or statistics.channel_message_counts.get(channel.id))
             }
         )
 
     def topics_of(self, schemas: Collection[str]) -> list[str]:
         """Return the topics with messages of one of these types."""
-        return [topic for topic, schema in self.topics if schema in schemas]
+        return [topic for topic, schema in self._schemas if schema in schemas]
 
     def read(
-        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[Message]:
-        """Yield the messages that arrived from `start_ns` on and before `end_ns`."""
+        self,
+        parse: Callable[[Message], T],
+        topics: Collection[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> Iterator[T]:
+        """Yield what `parse` makes of messages that arrived from `start_ns` on, before `end_ns`."""
         try:
             for schema, channel, message, content in self._reader.iter_decoded_messages(
                 topics, starting_at=start_ns, ending_before=end_ns
             ):
                 name = "" if schema is None else schema.name
-                yield Message(channel.topic, name, message.log_time, content)
-        except (*DAMAGE, DecodeError, LookupError) as error:
+                yield parse(Message(channel.topic, name, message.log_time, content))
+        except TrigpointError:
+            raise
+        # Decoders are made of the file's own schemas: what a damaged one raises, nobody can list.
+        except Exception as error:
             raise _damage(self._path, error) from error
 
 
@@ -130,10 +144,11 @@ def read_image(path: Path, name: str) -> NDArray[np.uint8]:
     """Decode one image of a recording to gray levels (H, W)."""
     topic, _, time = name.rpartition("/")
     time_ns = int(time) if time.isdecimal() else -1
-    for message in _open(path).read([topic], time_ns, time_ns + 1):
-        if message.schema in IMAGES:
+    recording = _open(path)
+    if topic in recording.topics_of(IMAGES):
+        for image in recording.read(parse_image, [topic], time_ns, time_ns + 1):
             try:
-                return parse_image(message).gray()
+                return image.gray()
             except SourceError as error:
                 raise SourceError(f"{path}: {name}: {error}") from error
     raise SourceError(f"{path} has no image {name}")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 
 from tests.unit import slam_layouts as layouts
 from tests.unit.layouts import POSES, View, check_truth
@@ -242,6 +243,23 @@ def test_one_of_several_cameras_and_sources_of_poses(flight: Flight, tmp_path: P
         read_dataset(path, image_topic="/odom")
     with pytest.raises(ConfigError, match="none of the 4 images lies between two poses"):
         read_dataset(path, image_topic=TOPIC, pose_topic="/wheels")
+
+
+def test_topics_without_messages_are_no_choice(flight: Flight, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start()
+        for kind, encoding in (("nav_msgs/msg/Odometry", "ros2msg"), ("sensor_msgs/Image", "idl")):
+            schema = writer.register_schema(kind, encoding, b"")
+            writer.register_channel("/silent", "cdr", schema)
+        writer.register_channel("/nothing known", "json", 0)
+        writer.add_message(3, 0, b"{}", 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(ConfigError, match=r"a\.mcap has no images of a known type"):
+        read_dataset(path)
+    with pytest.raises(ConfigError, match=r"a\.mcap has no images of a known type"):
+        read_dataset(path, image_topic="/silent")
 
 
 def test_a_map_is_built_from_a_recording_as_from_its_files(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -49,16 +50,17 @@ def read_joints(where: str, recording: Recording) -> dict[str, Joint]:
     parents: dict[str, str] = {}
     poses: dict[str, list[tuple[int, Rigid3]]] = {}
     moving: set[str] = set()
-    for message in recording.read(recording.topics_of(TRANSFORMS)):
-        for time_ns, parent, child, parent_from_child in _transforms(where, message):
-            if parents.setdefault(child, parent) != parent:
-                raise ConfigError(
-                    f"{where}: the frame {child} sits on {parents[child]} and, "
-                    f"at {time_ns} ns on {message.topic}, on {parent}; a frame has one parent"
-                )
-            poses.setdefault(child, []).append((time_ns, parent_from_child))
-            if not message.topic.endswith("tf_static"):
-                moving.add(child)
+    for topic in recording.topics_of(TRANSFORMS):
+        for transforms in recording.read(partial(_parse_transforms, where), [topic]):
+            for time_ns, parent, child, parent_from_child in transforms:
+                if parents.setdefault(child, parent) != parent:
+                    raise ConfigError(
+                        f"{where}: the frame {child} sits on {parents[child]} and, "
+                        f"at {time_ns} ns on {topic}, on {parent}; a frame has one parent"
+                    )
+                poses.setdefault(child, []).append((time_ns, parent_from_child))
+                if not topic.endswith("tf_static"):
+                    moving.add(child)
     return {
         child: _joint(f"{where}: frame {child}", parents[child], found, child in moving)
         for child, found in poses.items()
@@ -71,9 +73,9 @@ def _joint(where: str, parent: str, poses: list[tuple[int, Rigid3]], moving: boo
     return Joint(parent, trajectory, is_static=not moving or len(trajectory.times_ns) == 1)
 
 
-def _transforms(where: str, message: Message) -> Iterator[tuple[int, str, str, Rigid3]]:
-    """Yield time, parent, child and parent_from_child of what a message of `TRANSFORMS` holds."""
-    content = message.content
+def _parse_transforms(where: str, message: Message) -> list[tuple[int, str, str, Rigid3]]:
+    """Read time, parent, child and parent_from_child of what a message of `TRANSFORMS` holds."""
+    content, found = message.content, []
     for each in getattr(content, "transforms", [content]):
         time_ns = stamp_ns(each) or message.log_time_ns
         is_ros = hasattr(each, "header")
@@ -81,21 +83,26 @@ def _transforms(where: str, message: Message) -> Iterator[tuple[int, str, str, R
         child = each.child_frame_id.removeprefix("/")
         values = each.transform if is_ros else each
         at = f"{where}: the transform of {child} at {time_ns} ns"
-        yield time_ns, parent, child, _rigid(at, values.rotation, values.translation)
+        found.append((time_ns, parent, child, _rigid(at, values.rotation, values.translation)))
+    return found
 
 
 def read_poses(where: str, recording: Recording, topic: str) -> tuple[Trajectory, str]:
     """Read world_from_body of a topic of `POSES`, and the frame of the body, where it is told."""
-    times_ns, poses, bodies = [], [], set()
-    for message in recording.read([topic]):
-        pose = POSES[message.schema](message.content)
-        at = f"{where}: the pose on {topic} at {message.time_ns} ns"
-        times_ns.append(message.time_ns)
-        poses.append(_rigid(at, pose.orientation, pose.position))
-        bodies.add(getattr(message.content, "child_frame_id", "").removeprefix("/"))
-    if len(bodies) != 1:
-        raise ConfigError(f"{where}: the poses on {topic} are of {len(bodies)} bodies")
-    return Trajectory.from_poses(f"{where}: {topic}", times_ns, poses), bodies.pop()
+    times_ns, poses, bodies = zip(
+        *recording.read(partial(_parse_pose, where), [topic]), strict=True
+    )
+    if len(set(bodies)) != 1:
+        raise ConfigError(f"{where}: the poses on {topic} are of {len(set(bodies))} bodies")
+    return Trajectory.from_poses(f"{where}: {topic}", times_ns, poses), bodies[0]
+
+
+def _parse_pose(where: str, message: Message) -> tuple[int, Rigid3, str]:
+    """Read time, world_from_body and the body's frame of a message of `POSES`."""
+    pose = POSES[message.schema](message.content)
+    at = f"{where}: the pose on {message.topic} at {message.time_ns} ns"
+    body = getattr(message.content, "child_frame_id", "").removeprefix("/")
+    return message.time_ns, _rigid(at, pose.orientation, pose.position), body
 
 
 def _rigid(where: str, q: Any, t: Any) -> Rigid3:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from trigpoint.camera import Camera
-from trigpoint.camera_messages import choose_calibration, is_rectified
+from trigpoint.camera_messages import Calibration, choose_calibration, is_rectified
 from trigpoint.errors import ConfigError, SourceError
 from trigpoint.rigid import Rigid3
 from trigpoint_db.importers.base import Dataset
@@ -84,11 +84,11 @@ def read(
 
 
 def _choose(root: Path, kind: str, topics: Sequence[str], wanted: str | None) -> str:
-    listed = ", ".join(topics) or "no topic"
-    if wanted is not None and wanted not in topics:
-        raise ConfigError(f"{root} has no {kind}s on {wanted}, but on {listed}")
+    listed = ", ".join(topics)
     if not topics:
         raise ConfigError(f"{root} has no {kind}s of a known type")
+    if wanted is not None and wanted not in topics:
+        raise ConfigError(f"{root} has no {kind}s on {wanted}, but on {listed}")
     if wanted is None and len(topics) > 1:
         raise ConfigError(f"{root} has {kind}s on {listed}; name one with --{kind}-topic")
     return wanted or topics[0]
@@ -99,38 +99,44 @@ def _read_images(root: Path, recording: Recording, topic: str) -> tuple[list[Tim
     cameras = _Cameras(root, recording, topic)
     images: dict[str, TimedImage] = {}
     frames: set[str] = set()
-    for message in recording.read([topic]):
-        name = image_name(message)
+    for name, time_ns, log_time_ns, frame in recording.read(_parse_image, [topic]):
         if name in images:
-            raise ConfigError(f"{root}: two images on {topic} arrived at {message.log_time_ns} ns")
-        camera = cameras.at(message.log_time_ns)
-        images[name] = TimedImage(message.time_ns, name, camera)
-        frames.add(frame_of(message.content))
+            raise ConfigError(f"{root}: two images on {topic} arrived at {log_time_ns} ns")
+        images[name] = TimedImage(time_ns, name, cameras.at(log_time_ns))
+        frames.add(frame)
     if len(frames) != 1:
         raise ConfigError(f"{root}: the images on {topic} are of {len(frames)} frames")
     return list(images.values()), frames.pop()
+
+
+def _parse_image(message: Message) -> tuple[str, int, int, str]:
+    return image_name(message), message.time_ns, message.log_time_ns, frame_of(message.content)
+
+
+def _parse_calibration(message: Message) -> tuple[int, Calibration]:
+    return message.log_time_ns, parse_calibration(message)
 
 
 class _Cameras:
     """The calibrations of the camera of an image topic: each holds until the next."""
 
     def __init__(self, root: Path, recording: Recording, image_topic: str) -> None:
-        found: dict[str, list[Message]] = {}
-        for message in recording.read(recording.topics_of(CALIBRATIONS)):
-            found.setdefault(message.topic, []).append(message)
+        found = {
+            topic: list(recording.read(_parse_calibration, [topic]))
+            for topic in recording.topics_of(CALIBRATIONS)
+        }
 
         def is_in_frame(topic: str) -> bool:
-            image = next(recording.read([image_topic]))
-            frame = frame_of(image.content)
-            return frame != "" and frame_of(found[topic][0].content) == frame
+            *_, frame = next(recording.read(_parse_image, [image_topic]))
+            return frame != "" and found[topic][0][1].frame_id == frame
 
         try:
             topic = choose_calibration(image_topic, found, is_in_frame)
             rectified = is_rectified(image_topic)
-            self._cameras = [parse_calibration(m).camera(rectified=rectified) for m in found[topic]]
+            self._cameras = [each.camera(rectified=rectified) for _, each in found[topic]]
         except SourceError as error:
             raise SourceError(f"{root}: {error}") from error
-        self._times_ns = [message.log_time_ns for message in found[topic]]
+        self._times_ns = [time_ns for time_ns, _ in found[topic]]
 
     def at(self, time_ns: int) -> Camera:
         return self._cameras[max(bisect_right(self._times_ns, time_ns) - 1, 0)]
