@@ -14,7 +14,7 @@ from trigpoint.images import read_size
 from trigpoint.rigid import Rigid3, quaternion_from_rotation
 from trigpoint_db.poses import Query
 
-_HEADER_BYTES = 1 << 20  # of an image file; the size stands behind a thumbnail, or a profile
+_HEADER_BYTES = 1 << 18  # of an image file; the size stands behind a thumbnail, or a profile
 _MAX_SKEW = 1e-3  # of a rotation printed with a few digits
 
 

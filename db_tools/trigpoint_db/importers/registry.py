@@ -28,7 +28,7 @@ class Importer(Protocol):
     """A module of this package: one format."""
 
     def detect(self, root: Path, /) -> bool:
-        """Say, from names of files alone, whether `root` has this format; never raises."""
+        """Say, from names of files alone, whether `root` has this format."""
 
     @property
     def read(self) -> Callable[..., Dataset]:
