@@ -21,7 +21,8 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.rigid import Rigid3
 from trigpoint_db.build import append_map, build_map
 from trigpoint_db.demo import CAMERA
-from trigpoint_db.importers.colmap import PosedImage, read_model
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import read_model
 from trigpointd.pipeline import Pipeline
 from trigpointd.sources.base import Captured
 
