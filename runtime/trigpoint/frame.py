@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from datetime import date
 from enum import StrEnum
 from typing import Any
 
@@ -105,6 +106,23 @@ class PoseNoise:
         position = np.hypot(self.position, self.position_drift * distances)
         rotation = np.hypot(self.rotation_rad, self.rotation_drift_rad * distances)
         return np.repeat(np.column_stack([position, rotation]), 3, axis=1)
+
+
+@dataclass(frozen=True)
+class Session:
+    """A survey: images of a map that were taken on one occasion."""
+
+    name: str
+    date: date | None = None
+
+    def __post_init__(self) -> None:
+        if not (1 <= len(self.name) <= 100 and self.name.isprintable()):
+            raise ConfigError(
+                f"a session's name has 1 to 100 printable characters; it is {self.name[:100]!r}"
+            )
+
+    def __str__(self) -> str:
+        return self.name if self.date is None else f"{self.name} ({self.date})"
 
 
 @dataclass(frozen=True, eq=False)
