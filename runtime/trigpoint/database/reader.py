@@ -117,8 +117,10 @@ class MapReader:
             _require_index(snapshot, index)
             block, place = divmod(index, schema.BLOCK_ROWS)
             row = _block(snapshot, block).row(place)
+            image = bytes(snapshot.get(schema.image_key(index)))
             return schema.Record(
-                bytes(snapshot.get(schema.image_key(index))),
+                schema.decode_name(memoryview(image)),
+                image,
                 bytes(snapshot.get(schema.features_key(index))),
                 row,
                 (None, *self.sessions)[row.session],

@@ -149,6 +149,7 @@ class Metadata:
 class Record:
     """An image as it lies in a map, ready for another one; `row.session` is the former's."""
 
+    name: str
     image: bytes
     features: bytes
     row: Row

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
@@ -17,7 +18,12 @@ from lmdb.verify import VerifyError, verify
 from trigpoint.camera import Camera
 from trigpoint.database import schema
 from trigpoint.database.pages import DamageError
-from trigpoint.database.snapshot import Snapshot, reporting, share_environment
+from trigpoint.database.snapshot import (
+    Snapshot,
+    reporting,
+    require_in_place,
+    share_environment,
+)
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import LocalFeatures, ModelIdentity, PoseNoise, Session
 from trigpoint.rigid import Rigid3
@@ -71,6 +77,12 @@ class MapWriter:
             fd = os.open(path, os.O_RDWR)
             undo.callback(os.close, fd)
             _lock(fd)
+            require_in_place(path, fd)
+            Snapshot(path, model).close()  # before LMDB writes to the lock file
+            environment = _writable_environment(path, fd)
+            # A writer killed at the end of its commit leaves all but the next writer at the commit
+            # before: without this, the metadata would be those of another tree.
+            environment.begin(write=True).abort()
             with closing(Snapshot(path, model)) as snapshot:
                 _require_sound(path)
                 writer = cls(path, fd, snapshot.metadata)
@@ -99,21 +111,21 @@ class MapWriter:
             image, arrays = schema.encode_image(name, camera, cam_from_world, features)
             scale, numbers = schema.quantize_row(features.global_descriptor)
             row = schema.Row(scale, schema.NO_SESSION, numbers)
-            return self._append(txn, name, schema.Record(image, arrays, row, session))
+            return self._append(txn, schema.Record(name, image, arrays, row, session))
 
-    def add_record(self, name: str, record: schema.Record) -> int:
-        """Add an image as it lies in another map of the same model, and return its index."""
+    def add_record(self, record: schema.Record, name: str) -> int:
+        """Add an image of another map of the same model under a name; return its index."""
         with self._writing() as txn:
             _require_name(name)
             image = schema.rename_image(record.image, name)
-            return self._append(txn, name, replace(record, image=image))
+            return self._append(txn, replace(record, name=name, image=image))
 
-    def _append(self, txn: lmdb.Transaction, name: str, record: schema.Record) -> int:
-        if txn.get(schema.name_key(name)) is not None:
-            raise DatabaseError(f"holds an image {name!r} already")
+    def _append(self, txn: lmdb.Transaction, record: schema.Record) -> int:
+        if txn.get(schema.name_key(record.name)) is not None:
+            raise DatabaseError(f"holds an image {record.name!r} already")
         index = self._num_images
         row = record.row._replace(session=self._number_of(record.session))
-        _put(txn, schema.name_key(name), schema.encode_index(index))
+        _put(txn, schema.name_key(record.name), schema.encode_index(index))
         _put(txn, schema.image_key(index), record.image)
         _put(txn, schema.features_key(index), record.features)
         self._rows.append(row)
@@ -188,6 +200,21 @@ class MapWriter:
             _put(txn, schema.METADATA_KEY, metadata.encode())
             txn.commit()
             self._txn, self._metadata, self._has_removed = None, metadata, False
+
+    def copy_to(self, path: Path) -> None:
+        """Write what was committed to a new file of the same owner and mode, without free pages."""
+        with reporting(self._path):
+            if self._environment is None:
+                raise DatabaseError("this writer is closed")
+            status = os.fstat(self._fd)
+            fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            try:
+                os.fchown(fd, status.st_uid, status.st_gid)
+                os.fchmod(fd, stat.S_IMODE(status.st_mode))
+                self._environment.copyfd(fd, compact=True)
+                os.fsync(fd)
+            finally:
+                os.close(fd)
 
     def close(self) -> None:
         """Drop what was not committed and let other writers in."""
