@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from trigpoint.database.reader import MapReader
-from trigpoint.errors import DatabaseError, ModelError
+from trigpoint.errors import ConfigError, DatabaseError, ModelError
 from trigpoint.frame import Failed, Frame, Localized, Result, describe, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
@@ -100,11 +100,18 @@ class Pipeline:
         try:
             if self.reader.refresh():
                 _log.info("the map is now of generation %d", self.reader.generation)
+                self._look_for_sessions()
         except DatabaseError as error:
             problem = str(error)
         if problem and problem != self._map_problem:
             _log.error("%s; going on with the map as it was", problem)
         self._map_problem = problem
+
+    def _look_for_sessions(self) -> None:
+        try:
+            self.localizer.check_sessions()
+        except ConfigError as error:
+            self._report(f"{error}; going on without it")
 
     def _localize(self, frame: Frame | BadFrame) -> Result | Failed:
         if isinstance(frame, BadFrame):
@@ -113,11 +120,15 @@ class Pipeline:
             return self.localizer.localize(frame)
         except (DatabaseError, ModelError) as error:
             # A damaged image of the map, or a network that fails on this frame: others may do.
-            if str(error) not in self._reported:
-                self._reported.add(str(error))
-                _log.error("%s", error)
+            self._report(str(error))
             reason = "BAD_MAP" if isinstance(error, DatabaseError) else "BAD_NETWORK"
             return Failed(reason, str(error))
+
+    def _report(self, problem: str) -> None:
+        """Say once what is wrong."""
+        if problem not in self._reported:
+            self._reported.add(problem)
+            _log.error("%s", problem)
 
 
 @contextlib.contextmanager
@@ -134,4 +145,5 @@ def open_pipeline(config: Config) -> Iterator[Pipeline]:
         localizer = Localizer(
             model, reader, config.localizer, clock=time.perf_counter, matcher=matcher
         )
+        localizer.check_sessions()
         yield Pipeline(localizer, reader, config.camera.body_from_camera, config.map_frame)
