@@ -66,7 +66,7 @@ golden: $(READY)
 bench: $(READY)
 	@mkdir -p build/bench && rm -f build/bench/map.tpmap
 	@if test -d $(KITCHEN); then \
-	  $(BIN)/trigpoint-db build build/bench/map.tpmap --colmap $(KITCHEN) --images $(KITCHEN)/images \
+	  $(BIN)/trigpoint-db build build/bench/map.tpmap $(KITCHEN) \
 	    --list $(KITCHEN)/map.txt >/dev/null && \
 	  $(BIN)/python benchmarks/stage_times.py build/bench/map.tpmap \
 	    --images $(KITCHEN)/images --queries $(KITCHEN)/queries.txt; \

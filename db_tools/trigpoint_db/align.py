@@ -14,7 +14,7 @@ from trigpoint.frame import Localized
 from trigpoint.geometry.similarity import SimilarityConsensus, estimate_similarity
 from trigpoint.localizer import Localizer
 from trigpoint.rigid import Rigid3, rotation_angle
-from trigpoint_db.importers.colmap import PosedImage
+from trigpoint_db.importers.base import PosedImage
 from trigpoint_db.localize import Outcome, localize_images
 from trigpoint_db.poses import Query
 

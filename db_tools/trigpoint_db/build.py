@@ -13,7 +13,8 @@ from trigpoint.errors import ConfigError
 from trigpoint.frame import Frame, Session
 from trigpoint.images import read_gray
 from trigpoint.models.features import FeatureModel
-from trigpoint_db.importers.colmap import PosedImage
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.messages import read_image
 
 COMMIT_EVERY = 100  # images of a new map; until then they are in memory
 
@@ -24,7 +25,7 @@ def select_images(images: Sequence[PosedImage], names: Sequence[str]) -> list[Po
     unknown = [name for name in names if name not in by_name]
     if unknown:
         raise ConfigError(
-            f"{len(unknown)} of {len(names)} listed images are not in the COLMAP model, "
+            f"{len(unknown)} of {len(names)} listed images are not among those with a pose, "
             f"such as {unknown[0]!r}"
         )
     return [by_name[name] for name in names]
@@ -46,19 +47,22 @@ def select_new(
     return new
 
 
-def check_files(names: Iterable[str], folder: Path) -> None:
-    """Refuse before any work is done where an image is missing."""
-    missing = [name for name in names if not (folder / name).is_file()]
+def check_files(names: Iterable[str], images: Path) -> None:
+    """Refuse before any work is done where an image is missing in a folder."""
+    if images.is_file():
+        return  # a recording
+    missing = [name for name in names if not (images / name).is_file()]
     if missing:
-        raise ConfigError(f"{len(missing)} images are missing in {folder}, such as {missing[0]!r}")
+        raise ConfigError(f"{len(missing)} images are missing in {images}, such as {missing[0]!r}")
 
 
-def read_frame(path: Path, camera: Camera, name: str) -> Frame:
-    """Read an image file that a camera has taken."""
+def read_frame(images: Path, name: str, camera: Camera) -> Frame:
+    """Read an image that a camera has taken, from a folder or from a recording."""
     try:
-        return Frame(read_gray(path), camera, name=name)
+        gray = read_image(images, name) if images.is_file() else read_gray(images / name)
+        return Frame(gray, camera, name=name)
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise ConfigError(f"{images}: {name}: {error}") from error
 
 
 def build_map(
@@ -70,7 +74,10 @@ def build_map(
     max_keypoints: int = 1024,
     session: Session | None = None,
 ) -> int:
-    """Write a new map; it appears under its name when it is complete. Returns the image count."""
+    """Write a new map; it appears under its name when it is complete. Returns the image count.
+
+    The images are read from `folder` by `read_frame`.
+    """
     with new_map(path, model.identity) as writer:
         for image in images:
             _add(writer, image, folder, model, max_keypoints, session)
@@ -105,6 +112,6 @@ def _add(
     max_keypoints: int,
     session: Session | None,
 ) -> None:
-    frame = read_frame(folder / image.name, image.camera, image.name)
+    frame = read_frame(folder, image.name, image.camera)
     features = model.extract(frame.image, max_keypoints)
     writer.add(image.name, image.camera, image.cam_from_world, features, session)

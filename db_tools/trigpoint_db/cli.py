@@ -40,7 +40,10 @@ from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.cli_maps import app as maps
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths
+from trigpoint_db.importers import cli as importers_cli
+from trigpoint_db.importers.cli import Format, Images, Poses, Source
 from trigpoint_db.importers.colmap import read_model
+from trigpoint_db.importers.registry import read_dataset
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import localize_images
 from trigpoint_db.maps import count_sessions
@@ -66,9 +69,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-
-
 app.add_typer(maps)  # on the same level
+app.add_typer(importers_cli.app)
 
 
 @app.callback()
@@ -80,8 +82,28 @@ def _set_up() -> None:
 @app.command()
 def build(
     map_: MapPath,
-    colmap: Annotated[Path, typer.Option(help="Folder of a COLMAP model, text or binary.")],
-    images: Annotated[Path, typer.Option(help="Folder of the images.")],
+    source: Source,
+    format_: Format = None,
+    images: Images = None,
+    poses: Poses = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Of tum: its name, or 'MODEL width height params...'.")
+    ] = None,
+    image_topic: Annotated[
+        str | None, typer.Option(help="Of mcap: one of several cameras.")
+    ] = None,
+    pose_topic: Annotated[str | None, typer.Option(help="Of mcap: one of several sources.")] = None,
+    mount: Annotated[
+        str | None,
+        typer.Option(
+            metavar="'X Y Z QW QX QY QZ'|FRAME",
+            help="Of mcap: where the camera sits on what the poses are of, or the frame of that.",
+        ),
+    ] = None,
+    max_gap: Annotated[
+        float | None,
+        typer.Option(help="Of tum, euroc, mcap: seconds between two poses, at most.", min=0),
+    ] = None,
     list_: Annotated[Path | None, typer.Option("--list", help="Only these names.")] = None,
     append: Annotated[bool, typer.Option("--append", help="Add to a map.")] = False,
     skip_existing: Annotated[
@@ -96,26 +118,43 @@ def build(
 ) -> None:
     """Make a map from images with known poses."""
     survey = make_session(session, date)
-    posed = read_model(colmap)
+    dataset = read_dataset(
+        source,
+        format_,
+        images=images,
+        poses=poses,
+        camera=camera,
+        image_topic=image_topic,
+        pose_topic=pose_topic,
+        mount=mount,
+        max_gap=max_gap,
+    )
+    posed = dataset.mapped
     if list_ is not None:
         posed = select_images(posed, read_names(list_))
     if not posed:
-        raise ConfigError(f"there are no images to map: {list_ or colmap} names none")
+        raise ConfigError(f"there are no images to map: {list_ or source} names none")
     check_output(map_)
     if append:
         posed = select_new(posed, map_, skip_existing=skip_existing)
-    check_files((image.name for image in posed), images)
+    check_files((image.name for image in posed), dataset.images)
     write = append_map if append else build_map
     network = FeatureModel.load(model, retrieval=retrieval)
     images_to_map = track(posed, "mapping", len(posed))
-    count = write(map_, images_to_map, images, network, max_keypoints=keypoints, session=survey)
+    count = write(
+        map_, images_to_map, dataset.images, network, max_keypoints=keypoints, session=survey
+    )
     noise = calibrate_map(map_, network, track_calibration)
     size = map_.stat().st_size
     if as_json:
         facts = {"map": str(map_), "num_images_added": count, "bytes": size}
+        facts["num_unposed"] = dataset.num_unposed
         print(json.dumps(facts | {"pose_noise": noise and asdict(noise)}))
     else:
-        print(f"{map_}: {count} images added, {size / 1e6:.1f} MB; {describe_noise(noise)}")
+        unposed = f", {dataset.num_unposed} without a pose left out" * bool(dataset.num_unposed)
+        print(
+            f"{map_}: {count} images added{unposed}, {size / 1e6:.1f} MB; {describe_noise(noise)}"
+        )
 
 
 @app.command()

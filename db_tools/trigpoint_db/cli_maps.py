@@ -20,7 +20,8 @@ from trigpoint.models.features import FeatureModel
 from trigpoint_db.align import Alignment, align_survey, choose_spread
 from trigpoint_db.build import append_map, check_files, select_new
 from trigpoint_db.calibrate import calibrate_map
-from trigpoint_db.importers.colmap import PosedImage, read_model, write_model
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import read_model, write_model
 from trigpoint_db.maps import (
     Difference,
     compare_maps,

@@ -23,7 +23,8 @@ from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
 from trigpoint_db.build import append_map, build_map
 from trigpoint_db.demo import CAMERA
-from trigpoint_db.importers.colmap import PosedImage, read_model
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import read_model
 from trigpointd.config import Config, McapConfig
 from trigpointd.pipeline import Pipeline, open_pipeline
 from trigpointd.sources.base import Captured

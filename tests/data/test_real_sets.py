@@ -60,10 +60,7 @@ def test_real_queries_are_localized(
     folder = DATA / name
     queries = folder / f"queries{split}.txt"
     map_, poses, results = tmp_path / "m.tpmap", tmp_path / "poses.txt", tmp_path / "results.jsonl"
-    trigpoint_db(
-        "build", map_, "--colmap", folder / "sparse", "--images", folder / "images",
-        "--list", folder / f"map{split}.txt",
-    )  # fmt: skip
+    trigpoint_db("build", map_, folder, "--list", folder / f"map{split}.txt")
     trigpoint_db(
         "localize", map_, "--images", folder / "images", "--queries", queries,
         "--poses", poses, "--results", results,
@@ -97,7 +94,7 @@ def test_one_half_of_a_survey_comes_back_into_the_frame_of_the_other(
     (tmp_path / "map.txt").write_text("\n".join(image.name for image in posed[::2]))
     map_ = tmp_path / "m.tpmap"
     trigpoint_db(
-        "build", map_, "--colmap", folder / "sparse", "--images", folder / "images",
+        "build", map_, folder / "sparse", "--images", folder / "images",
         "--list", tmp_path / "map.txt",
     )  # fmt: skip
     report = json.loads(
@@ -118,7 +115,7 @@ def test_one_half_of_a_survey_comes_back_into_the_frame_of_the_other(
 def test_frames_of_another_place_are_refused(tmp_path: Path) -> None:
     kitchen, truck = DATA / "7scenes_redkitchen", DATA / "tnt_truck"
     map_, poses = tmp_path / "m.tpmap", tmp_path / "poses.txt"
-    trigpoint_db("build", map_, "--colmap", kitchen / "sparse", "--images", kitchen / "images")
+    trigpoint_db("build", map_, kitchen)
     said = trigpoint_db(
         "localize", map_, "--images", truck / "images", "--queries", truck / "queries.txt",
         "--poses", poses, code=1,
@@ -129,8 +126,7 @@ def test_frames_of_another_place_are_refused(tmp_path: Path) -> None:
 
 def test_a_second_process_receives_every_pose_of_the_kitchen(tmp_path: Path, port: int) -> None:
     kitchen = DATA / "7scenes_redkitchen"
-    sources = ["--colmap", kitchen / "sparse", "--images", kitchen / "images"]
-    trigpoint_db("build", tmp_path / "kitchen.tpmap", *sources, "--list", kitchen / "map.txt")
+    trigpoint_db("build", tmp_path / "kitchen.tpmap", kitchen, "--list", kitchen / "map.txt")
     trigpoint_db(
         "record", tmp_path / "kitchen.mcap", "--images", kitchen / "images",
         "--queries", kitchen / "queries.txt", "--truth", kitchen,

@@ -13,7 +13,8 @@ from trigpoint.database.reader import MapReader
 from trigpoint.database.replacing import new_map
 from trigpoint.geometry.similarity import Similarity3
 from trigpoint.rigid import rotation_angle, rotation_from_vector
-from trigpoint_db.importers.colmap import PosedImage, read_model, write_model
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import read_model, write_model
 
 MAP_FROM_SURVEY = Similarity3(
     3.7, rotation_from_vector(np.array([0.4, -1.1, 2.0])), np.array([12.0, -3.0, 40.0])

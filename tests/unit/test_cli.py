@@ -31,8 +31,7 @@ def place(demo: Demo, tmp_path: Path) -> Path:
 
 
 def build(place: Path, name: str = "m.tpmap", *more: object) -> list[object]:
-    sources = ["--colmap", place / "sparse", "--images", place / "images"]
-    return ["build", place / name, *sources, *more]
+    return ["build", place / name, place, *more]
 
 
 def test_from_images_to_numbers(run: Run, place: Path) -> None:

@@ -14,12 +14,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from trigpoint.camera import Camera
+from trigpoint.camera_messages import Calibration, Image
 from trigpoint.errors import ConfigError, SourceError
 from trigpointd.backoff import Backoff
 from trigpointd.clock import WallClock
 from trigpointd.config import DepthaiConfig
 from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
-from trigpointd.messages.images import Calibration, Image, to_frame
+from trigpointd.messages.images import to_frame
 from trigpointd.sources.base import BadFrame, Captured, Message
 
 _log = logging.getLogger(__name__)

@@ -11,13 +11,14 @@ import select
 import time
 from collections.abc import AsyncGenerator, Generator, Iterator
 
+from trigpoint.camera_messages import Image
 from trigpoint.errors import SourceError
 from trigpoint.frame import Frame
 from trigpointd.backoff import Backoff
 from trigpointd.clock import WallClock
 from trigpointd.config import V4l2Config
 from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
-from trigpointd.messages.images import Image, parse_calibration, to_frame
+from trigpointd.messages.images import parse_calibration, to_frame
 from trigpointd.sources.base import BadFrame, Captured
 from trigpointd.sources.video_device import Kernel, Linux, RawFrame, VideoDevice, VideoFormat
 
