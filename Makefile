@@ -16,7 +16,7 @@ SECONDS ?= 600
 LIB = $(DESTDIR)$(PREFIX)/lib
 SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
-.PHONY: demo test test-oak test-systemd test-v4l2 check golden
+.PHONY: demo test kill-test test-oak test-systemd test-v4l2 check golden
 .PHONY: bench bench-models bench-localizer bench-daemon soak wheel-test clean
 .PHONY: install install-program install-units uninstall
 
@@ -47,6 +47,10 @@ check: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python -m pytest
+
+# A map changed by processes that are killed at random moments; half a minute.
+kill-test: $(READY)
+	$(BIN)/python -m tests.unit.run_kills 200
 
 # The camera source on a real kernel's virtual camera, in qemu; about a minute.
 test-v4l2: $(READY)

@@ -7,17 +7,15 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 import threadpoolctl
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from trigpoint.camera import Camera
@@ -31,47 +29,54 @@ from trigpoint.options import LocalizerOptions
 from trigpoint.output import check_output, open_text
 from trigpoint.rigid import Rigid3
 from trigpoint_db.adapt import adapt_model
-from trigpoint_db.build import append_map, build_map, check_files, select_images
+from trigpoint_db.build import (
+    append_map,
+    build_map,
+    check_files,
+    select_images,
+    select_new,
+)
 from trigpoint_db.calibrate import calibrate_map
+from trigpoint_db.cli_maps import app as maps
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths
 from trigpoint_db.importers import cli as importers_cli
-from trigpoint_db.importers.cli import Format, Images, Json, Poses, Source
+from trigpoint_db.importers.cli import Format, Images, Poses, Source
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.importers.registry import read_dataset
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import localize_images
+from trigpoint_db.maps import count_sessions
 from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
 from trigpoint_db.recording import FORMATS, RecordedImage, write_recording
 from trigpoint_db.recover import recover
+from trigpoint_db.terminal import (
+    Json,
+    MapPath,
+    Model,
+    Retrieval,
+    SessionDate,
+    SessionName,
+    console,
+    make_session,
+    track,
+    track_calibration,
+)
 
-T = TypeVar("T")
 app = typer.Typer(
     help="Off-line tools on maps, recordings and results.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(maps)  # on the same level
 app.add_typer(importers_cli.app)
-console = Console()
-Model = Annotated[str, typer.Option(help="The network: tiny, base, large, or a file (.onnx).")]
-Retrieval = Annotated[
-    Path | None, typer.Option(help="A retrieval network, where the other needs one beside it.")
-]
-MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="A .tpmap file.")]
 
 
 @app.callback()
 def _set_up() -> None:
     # As in the daemon: OpenBLAS's threads spin while they wait for each other.
     threadpoolctl.threadpool_limits(1, user_api="blas")
-
-
-def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
-    """Show a progress bar on standard error, which keeps standard output clean."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
-        yield from progress.track(items, total=total, description=what)
 
 
 @app.command()
@@ -101,12 +106,18 @@ def build(
     ] = None,
     list_: Annotated[Path | None, typer.Option("--list", help="Only these names.")] = None,
     append: Annotated[bool, typer.Option("--append", help="Add to a map.")] = False,
+    skip_existing: Annotated[
+        bool, typer.Option("--skip-existing", help="Leave out images that the map has.")
+    ] = False,
+    session: SessionName = None,
+    date: SessionDate = None,
     keypoints: Annotated[int, typer.Option(help="At most so many an image.", min=50)] = 1024,
     model: Model = "base",
     retrieval: Retrieval = None,
     as_json: Json = False,
 ) -> None:
     """Make a map from images with known poses."""
+    survey = make_session(session, date)
     dataset = read_dataset(
         source,
         format_,
@@ -124,11 +135,14 @@ def build(
     if not posed:
         raise ConfigError(f"there are no images to map: {list_ or source} names none")
     check_output(map_)
+    if append:
+        posed = select_new(posed, map_, skip_existing=skip_existing)
     check_files((image.name for image in posed), dataset.images)
     write = append_map if append else build_map
     network = FeatureModel.load(model, retrieval=retrieval)
+    images_to_map = track(posed, "mapping", len(posed))
     count = write(
-        map_, track(posed, "mapping", len(posed)), dataset.images, network, max_keypoints=keypoints
+        map_, images_to_map, dataset.images, network, max_keypoints=keypoints, session=survey
     )
     noise = calibrate_map(map_, network, track_calibration)
     size = map_.stat().st_size
@@ -165,11 +179,6 @@ def describe_noise(noise: PoseNoise | None) -> str:
         f"distance, {np.rad2deg(noise.rotation_rad):.2g} degrees and "
         f"{np.rad2deg(noise.rotation_drift_rad):.2g} for each unit of it"
     )
-
-
-def track_calibration(images: list[int]) -> Iterator[int]:
-    """Show a progress bar of a calibration."""
-    return track(images, "calibrating", len(images))
 
 
 @app.command()
@@ -279,6 +288,7 @@ def info(map_: MapPath, as_json: Json = False) -> None:
             "descriptor_dim": reader.model.descriptor_dim,
             "global_dim": reader.model.global_dim,
             "pose_noise": reader.pose_noise and asdict(reader.pose_noise),
+            "sessions": count_sessions(reader),
             "bytes": map_.stat().st_size,
             "min_center": centers.min(axis=0).tolist() if len(centers) else None,
             "max_center": centers.max(axis=0).tolist() if len(centers) else None,
@@ -287,6 +297,9 @@ def info(map_: MapPath, as_json: Json = False) -> None:
         print(json.dumps(facts))
         return
     table = Table(show_header=False)
+    for session in facts.pop("sessions"):
+        about = f"session {session['name'] or 'none'}", session["date"] or ""
+        table.add_row(" ".join(about), f"{session['num_images']} images")
     for key, value in facts.items():
         table.add_row(key, str(value))
     console.print(table)

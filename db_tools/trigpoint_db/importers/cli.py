@@ -16,9 +16,9 @@ from trigpoint_db.importers.registry import IMPORTERS, read_dataset
 from trigpoint_db.poses import read_poses, write_poses, write_queries
 from trigpoint_db.public_sets import PUBLIC_SETS
 from trigpoint_db.submit import BENCHMARKS, write_submission
+from trigpoint_db.terminal import Json
 
 app = typer.Typer()
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
 Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="A data set's folder or file.")]
 Format = Annotated[
     str | None,

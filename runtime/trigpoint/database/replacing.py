@@ -1,0 +1,78 @@
+"""Map files that appear under their names once they are whole."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import os
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from trigpoint.database.reader import MapReader
+from trigpoint.database.snapshot import put_in_place
+from trigpoint.database.writer import MapWriter
+from trigpoint.errors import DatabaseError
+from trigpoint.frame import ModelIdentity
+
+
+@contextmanager
+def new_map(path: Path, model: ModelIdentity) -> Iterator[MapWriter]:
+    """Write a map that is there when it is complete; one that is there already is an error."""
+    _refuse_existing(path)
+    with _partial_file(path) as partial:
+        try:
+            with MapWriter.create(partial, model) as writer:
+                yield writer
+        except DatabaseError as error:
+            raise DatabaseError(str(error).replace(str(partial), str(path))) from error
+        _refuse_existing(path)
+        partial.rename(path)
+
+
+def compact_map(path: Path) -> None:
+    """Rewrite a map without the pages that no image needs any more, as LMDB does.
+
+    The new file takes the place of the old one when it is on disk. Readers keep the old one until
+    they refresh; other writers are turned away meanwhile. A damaged map is an error.
+    """
+    path = path.resolve()  # the file itself is replaced, not a link to it
+    with MapReader.open(path) as reader:
+        problems = reader.verify()
+        model = reader.model
+    if problems:
+        raise DatabaseError(f"{path}: is damaged and stays as it is: {problems[0]}")
+    with closing(MapWriter.open(path, model)) as writer, _partial_file(path) as partial:
+        writer.copy_to(partial)
+        put_in_place(partial, path)
+
+
+def _refuse_existing(path: Path) -> None:
+    if path.exists():
+        raise DatabaseError(
+            f"{path} exists; name another file, remove it, or add to it: trigpoint-db build "
+            "--append"
+        )
+
+
+@contextmanager
+def _partial_file(path: Path) -> Iterator[Path]:
+    """Name a file beside a map for its making; no such file stays, nor those of killed processes.
+
+    Each process has one of its own, so that two at once do not meet.
+    """
+    for leftover in path.parent.glob(f"{glob.escape(path.name)}.*.partial*"):  # lock files too
+        owner = leftover.name.removeprefix(path.name + ".").partition(".")[0]
+        if owner.isdecimal() and not Path("/proc", owner).exists():
+            _remove(leftover)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+    finally:
+        _remove(partial)
+        _remove(partial.with_name(partial.name + "-lock"))
+
+
+def _remove(leftover: Path) -> None:
+    with contextlib.suppress(OSError):
+        leftover.unlink()
