@@ -8,7 +8,7 @@ DATA := ../shared/data
 KITCHEN := $(DATA)/7scenes_redkitchen
 # Everyday pictures without poses, a tenth of which no training sees.
 PHOTOGRAPHS := ../shared/train_images/images
-# `make install`, docs/install.md: packages set DESTDIR and PREFIX=/usr; EXTRAS=oak for OAK cameras.
+# `make install`, docs/install.md: packages set DESTDIR and PREFIX=/usr; EXTRAS=oak,foxglove (pyproject.toml).
 PREFIX ?= /usr/local
 EXTRAS ?=
 # `make soak`.
@@ -96,7 +96,7 @@ bench-localizer: $(READY)
 	  $(if $(HLOC),--hloc '$(HLOC)') $(if $(EDGEPOINT2),--edgepoint2 '$(EDGEPOINT2)') \
 	  --output build/bench/localizer.md --picture build/bench/reliability.png
 
-# What the daemon adds to the localizer's time, from a camera to a subscriber; about 8 minutes.
+# What the daemon adds to the localizer's time, from a camera to a subscriber; about 6 minutes.
 bench-daemon: $(READY) $(DEMO)/map.tpmap
 	@mkdir -p build/bench
 	$(BIN)/python -m benchmarks.daemon.overhead $(DEMO) --output build/bench/daemon.md

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import signal
 import socket
@@ -119,11 +120,11 @@ def subscriber(receive: Callable[[str, bytes, int], None]) -> Iterator[tuple[zen
 
 
 @contextlib.contextmanager
-def running(settings: Path, *launch: str) -> Iterator[Process]:
+def running(settings: Path, *launch: str, **environment: str) -> Iterator[Process]:
     """Run the daemon by a module and its arguments; it must live, and end in order."""
     command = [sys.executable, "-m", *launch, "run", "--config", str(settings.resolve())]
     with (settings.parent / "stderr.txt").open("wb") as stderr:
-        process = Process(command, cwd=_ROOT, stderr=stderr)
+        process = Process(command, cwd=_ROOT, stderr=stderr, env={**os.environ, **environment})
     try:
         yield process
         check_alive(process)

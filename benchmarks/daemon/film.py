@@ -128,7 +128,7 @@ def _check(result: int) -> int:
 
 def main() -> None:
     """Be trigpointd."""
-    v4l2.Linux = FilmKernel  # type: ignore[misc,assignment]
+    v4l2.Linux = FilmKernel  # type: ignore[attr-defined,assignment]
     cli.main()
 
 

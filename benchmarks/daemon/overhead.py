@@ -1,6 +1,6 @@
 """What the daemon adds to the localizer's time, from the camera to a subscriber.
 
-    python -m benchmarks.daemon.overhead DEMO [--frames 1500] [--fps 10] [--output FILE]
+    python -m benchmarks.daemon.overhead DEMO [--frames 1000] [--fps 10] [--output FILE]
 
 DEMO is a folder as `trigpoint-db demo` makes it. Its flight is played as a camera's frames to a
 `trigpointd run` of its own process, whose poses this process receives over loopback TCP.
@@ -102,7 +102,7 @@ def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("demo", type=Path)
-    parser.add_argument("--frames", type=int, default=1500)
+    parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--fps", type=float, default=10.0)
     parser.add_argument("--output", type=Path, help="Markdown")
     arguments = parser.parse_args()

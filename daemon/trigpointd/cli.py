@@ -33,8 +33,9 @@ from trigpointd.config import (
 )
 from trigpointd.pipeline import open_pipeline
 from trigpointd.service import open_source, run
+from trigpointd.session import load_settings, make_settings, set_endpoints
+from trigpointd.sinks.foxglove import import_sdk
 from trigpointd.sinks.log_files import LogFiles
-from trigpointd.sinks.zenoh import make_settings
 from trigpointd.sources.depthai import is_opening
 from trigpointd.watch import Received, subscribe
 
@@ -83,6 +84,8 @@ def check_config(config: Annotated[Path, typer.Argument(help="Settings, a TOML f
         make_settings(settings.zenoh)
     if settings.log is not None:
         check_output(LogFiles(settings.log.path).unnumbered())
+    if settings.foxglove is not None:
+        import_sdk()
     with open_pipeline(settings):
         source = open_source(settings)
         print(source.describe())
@@ -130,6 +133,9 @@ def watch(
     key: Annotated[str, typer.Option(help="Which poses.")] = "trigpoint/**/pose",
     connect: Annotated[list[str] | None, typer.Option(help="Endpoint to connect to.")] = None,
     listen: Annotated[list[str] | None, typer.Option(help="Endpoint to listen on.")] = None,
+    zenoh: Annotated[
+        Path | None, typer.Option(help="Zenoh's settings, a JSON5 file; for TLS, for one.")
+    ] = None,
     poses: Annotated[
         Path | None, typer.Option(help="Write `time_ns qw qx qy qz tx ty tz`, body_from_world.")
     ] = None,
@@ -138,16 +144,16 @@ def watch(
         bool, typer.Option("--exit-with-daemon", help="End when the daemon leaves.")
     ] = False,
 ) -> None:
-    """Print poses as they come over Zenoh, in their world frame."""
-    endpoints = [*(connect or ()), *(listen or ())]
-    config = ZenohConfig(
-        connect=tuple(connect or ()),
-        listen=tuple(listen or ()),
-        multicast_scouting=not endpoints,
-    )
+    """Print the last pose, then poses as they come over Zenoh, in their world frame."""
+    if zenoh is None:
+        settings = make_settings(ZenohConfig(multicast_scouting=not (connect or listen)))
+    else:
+        settings = load_settings(zenoh)
+    set_endpoints(settings, "connect", tuple(connect or ()))
+    set_endpoints(settings, "listen", tuple(listen or ()))
     check_output(poses)
     with ExitStack() as stack:
-        arriving = stack.enter_context(subscribe(config, key, exit_with_daemon=exit_with_daemon))
+        arriving = stack.enter_context(subscribe(settings, key, exit_with_daemon=exit_with_daemon))
         file = None if poses is None else stack.enter_context(open_text(poses))
         for received in arriving:
             if isinstance(received, str):

@@ -197,6 +197,7 @@ class LogConfig(Section):
 
     path: Path  # in the file's name %Y, %m, %d, %H, %M, %S stand for the time of its start
     frames: bool = True  # input images too, so that the log can be replayed
+    visuals: bool = True  # keypoints, anchors, path, for Foxglove
     overwrite: bool = False
     max_part_mb: Annotated[float, Field(ge=1)] | None = None  # then comes another part; off
     max_part_s: Annotated[float, Field(ge=1)] | None = None  # the same
@@ -225,6 +226,13 @@ class LogConfig(Section):
         return self.max_part_mb is not None or self.max_part_s is not None
 
 
+class FoxgloveConfig(Section):
+    """A live view; it needs the extra `foxglove`."""
+
+    host: str = "127.0.0.1"  # that viewers connect to
+    port: Annotated[int, Field(ge=1, le=65_535)] = 8765
+
+
 class Config(Section):
     """All settings of `trigpointd run`."""
 
@@ -237,6 +245,7 @@ class Config(Section):
     localizer: LocalizerOptions = LocalizerOptions()
     zenoh: ZenohConfig | None = None  # without the table nothing is published
     log: LogConfig | None = None
+    foxglove: FoxgloveConfig | None = None  # without the table there is no live view
 
 
 def load_config(path: Path) -> Config:

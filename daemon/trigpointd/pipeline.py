@@ -95,13 +95,15 @@ class Pipeline:
         """Take up what was added to the map; where that cannot be used, keep what there was."""
         problem = ""
         try:
-            if self.reader.refresh():
-                _log.info("the map is now of generation %d", self.reader.generation)
-                self._look_for_sessions()
+            is_new = self.reader.refresh()
         except DatabaseError as error:
-            problem = str(error)
+            is_new, problem = False, str(error)
         if problem and problem != self.map_problem:
-            _log.error("%s; going on with the map as it was", problem)
+            _log.error("%s; going on with the map as it was, as far as it can be read", problem)
+        elif is_new or (self.map_problem and not problem):
+            _log.info("the map is now of generation %d", self.reader.generation)
+            self._reported.clear()
+            self._look_for_sessions()
         self.map_problem = problem
 
     def _look_for_sessions(self) -> None:

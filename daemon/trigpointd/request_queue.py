@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 import time
 from collections import deque
@@ -12,6 +13,7 @@ from trigpoint.errors import RequestError
 from trigpointd.config import RequestsConfig
 from trigpointd.requests import Answer, Request
 
+_log = logging.getLogger(__name__)
 _BURST_S = 1.0  # so far ahead of its rate may a kind of request be
 
 Reply = Callable[[Answer], None]
@@ -67,7 +69,10 @@ class RequestQueue:
                         break
                     request, reply = self._waiting.popleft()
                 answer = await asyncio.to_thread(self._answer, request)
-            await asyncio.to_thread(reply, answer)
+            try:
+                await asyncio.to_thread(reply, answer)
+            except Exception:  # one that cannot be sent must not cost the others theirs
+                _log.exception("an answer could not be sent")
         with self._lock:
             self._loop = None
 

@@ -25,6 +25,7 @@ from trigpointd.requests import Responder
 from trigpointd.sd_notify import Heartbeat, notify
 from trigpointd.sinks.base import Sink
 from trigpointd.sinks.fanout import Fanout
+from trigpointd.sinks.foxglove import FoxgloveSink
 from trigpointd.sinks.poses import PoseFile
 from trigpointd.sinks.recorder import Recorder
 from trigpointd.sinks.rolling_log import RollingLog
@@ -94,6 +95,9 @@ def run(
             sinks = {"zenoh": zenoh, **sinks}  # poses go out before the log has its work with them
             _log.info("poses go to %s/pose", config.base_key)
             first = partial(zenoh.wait_for_subscriber, config.zenoh.wait_for_subscriber_s)
+        if config.foxglove is not None:
+            sinks["foxglove"] = FoxgloveSink(config.foxglove, config.base_key)
+            stack.callback(sinks["foxglove"].close)
         if poses is not None:
             sinks["poses"] = PoseFile(poses)
             stack.callback(sinks["poses"].close)

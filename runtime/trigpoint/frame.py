@@ -198,6 +198,34 @@ class Statistics:
 
 
 @dataclass(frozen=True, eq=False)
+class Support:
+    """What a refined pose rests on.
+
+    Parameters
+    ----------
+    cam_from_world : Rigid3
+        The pose, given or refused.
+    points2d : (M, 2) float64
+        The frame's keypoints that have a latent point, undistorted and normalised.
+    points3d : (M, 3) float64
+        Their latent points as refined, in the world.
+    inliers : (M,) bool
+        Which of them agree with the pose.
+    anchors_from_world : Rigid3
+        The anchors' poses (K,), in the order of `Statistics.anchors`.
+    anchor_inliers : (K,) int
+        How many of the inliers were triangulated from each; 0 where it has no say in the pose.
+    """
+
+    cam_from_world: Rigid3
+    points2d: NDArray[np.float64]
+    points3d: NDArray[np.float64]
+    inliers: NDArray[np.bool_]
+    anchors_from_world: Rigid3
+    anchor_inliers: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
 class Localized:
     """A pose that may be used.
 
@@ -211,20 +239,24 @@ class Localized:
         world's axes. This is also ROS's order and frame.
     statistics : Statistics
         How it came about.
+    support : Support
+        The points and anchors that it rests on.
     """
 
     cam_from_world: Rigid3
     covariance: NDArray[np.float64]
     statistics: Statistics
+    support: Support
 
 
 @dataclass(frozen=True, eq=False)
 class Lost:
-    """No pose, and why."""
+    """No pose, and why; with what speaks for one that was refused."""
 
     reason: Reason
     statistics: Statistics
     detail: str = ""
+    support: Support | None = None
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ from trigpoint.stages import (
     estimate_relative_poses,
     extract_turned,
     find_latent_points,
+    find_support,
     match_anchors,
     mean_distance,
     refine,
@@ -303,13 +304,15 @@ class Localizer:
                 options,
             )
             objection = judge(evidence, confidence, covariance, options)
+            rests_on = find_support(query, latent, refined)
         if objection is not None:
-            return Solution(trace.lost(*objection))
+            reason, detail = objection
+            return Solution(Lost(reason, trace.statistics, detail, rests_on))
         is_certain = (
             confidence >= options.enough_confidence
             and evidence.std_ratio < options.enough_position_std_ratio
         )
-        localized = Localized(refined.cam_from_world, covariance, trace.statistics)
+        localized = Localized(refined.cam_from_world, covariance, trace.statistics, rests_on)
         return Solution(localized, is_certain, refined, latent, MAX_DEPTHS * evidence.depth)
 
 

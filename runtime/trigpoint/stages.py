@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ModelError
-from trigpoint.frame import Anchor, LocalFeatures, PoseNoise, Reason
+from trigpoint.frame import Anchor, LocalFeatures, PoseNoise, Reason, Support
 from trigpoint.geometry.absolute_pose import estimate_absolute_pose
 from trigpoint.geometry.anchor_ransac import NoConsensus, find_consensus
 from trigpoint.geometry.center_averaging import (
@@ -299,6 +299,20 @@ def refine(
         max_error_px=options.max_reprojection_error_px,
     )
     return latent, refined
+
+
+def find_support(query: Query, latent: LatentPoints, refined: RefinedPose) -> Support:
+    """Gather what a refined pose rests on."""
+    tracks = latent.tracks
+    views = tracks.view[np.repeat(refined.inliers, tracks.lengths)]
+    return Support(
+        refined.cam_from_world,
+        query.points[latent.point],
+        refined.points3d,
+        refined.inliers,
+        query.views,
+        np.bincount(views, minlength=len(query.views)),
+    )
 
 
 def mean_distance(query: Query, latent: LatentPoints, cam_from_world: Rigid3) -> float:

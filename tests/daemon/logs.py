@@ -9,12 +9,15 @@ from pathlib import Path
 import numpy as np
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
+from mcap.records import Channel
 from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader
 
 from trigpoint.frame import Failed
 from trigpointd.pipeline import Output
 from trigpointd.sources.base import BadFrame, Captured
+
+STATUS = "base/status"
 
 
 def numbered(i: int, noise_bytes: int = 0) -> Output:
@@ -29,14 +32,18 @@ def numbers_in(path: Path) -> list[int]:
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_summary() is not None
-        return [json.loads(message.data)["i"] for _, _, message in reader.iter_messages()]
+        statuses = reader.iter_messages([STATUS])
+        return [json.loads(message.data)["i"] for _, _, message in statuses]
 
 
 def numbers_in_unfinished(path: Path) -> list[int]:
     """Read what comes before the place where a log breaks off, with mcap alone."""
-    found = []
+    found: list[int] = []
+    statuses = set[int]()  # ids of the channel, of which there may be one
     with path.open("rb") as stream, contextlib.suppress(EndOfFile):
         for record in StreamReader(stream).records:
-            if isinstance(record, Record):
-                found.append(json.loads(record.data)["i"])  # noqa: PERF401
+            if isinstance(record, Channel) and record.topic == STATUS:
+                statuses.add(record.id)
+            elif isinstance(record, Record) and record.channel_id in statuses:
+                found.append(json.loads(record.data)["i"])
     return found

@@ -403,6 +403,32 @@ def test_requests_of_many_threads_are_all_answered() -> None:
     assert sorted(answers) == sorted(str(number).encode() for number in range(100))
 
 
+def test_an_answer_that_cannot_be_sent_costs_the_others_nothing() -> None:
+    queue, _ = make_queue()
+    answers: list[Answer] = []
+
+    def fail(answer: Answer) -> None:
+        raise OSError("the network is gone")
+
+    async def ask_twice() -> None:
+        serving = asyncio.create_task(queue.serve(asyncio.Lock()))
+        answered = asyncio.Event()
+        loop = asyncio.get_running_loop()
+
+        def reply(answer: Answer) -> None:
+            answers.append(answer)
+            loop.call_soon_threadsafe(answered.set)
+
+        queue.put(Request("map", {}), fail)
+        queue.put(Request("map", {}), reply)
+        await asyncio.wait_for(answered.wait(), 30)
+        queue.close()
+        await serving
+
+    asyncio.run(ask_twice())
+    assert len(answers) == 1
+
+
 class Still:
     """A camera that has a frame whenever one is wanted, and so many of them."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import resource
 import shutil
@@ -254,6 +255,18 @@ def test_a_write_that_fails_pauses_the_log_and_is_said_once(
     [written] = tmp_path.iterdir()
     assert numbers_in(written) == list(range(log.num_unlogged, 100))
     assert [record.levelno for record in caplog.records] == [logging.ERROR, logging.WARNING]
+
+
+def test_a_mistake_of_ours_pauses_the_log_and_is_said_with_its_place(
+    open_log: Callable[..., RollingLog], clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = open_log()
+    log.write(dataclasses.replace(numbered(0), status=None))  # type: ignore[arg-type]
+    assert "NoneType" in log.problem
+    clock.now_s += 10
+    log.write(numbered(1))
+    assert log.problem == ""
+    assert caplog.records[0].exc_info
 
 
 def on_small_disk(folder: Path, scenario: Callable[[Path], None]) -> None:

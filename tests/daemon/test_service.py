@@ -139,11 +139,16 @@ def test_the_log_opens_with_independent_readers_and_replays(demo: Demo, tmp_path
         reader = make_reader(stream, decoder_factories=[ProtobufDecoders(), RosDecoders()])
         topics = [c.topic for c in reader.get_summary().channels.values()]  # type: ignore[union-attr]
         assert sorted(topics) == [
-            "/camera/calibration", "/camera/image", "trigpoint/test/pose", "trigpoint/test/status",
+            "/camera/calibration", "/camera/image", "trigpoint/test/anchors",
+            "trigpoint/test/annotations", "trigpoint/test/path", "trigpoint/test/points",
+            "trigpoint/test/pose", "trigpoint/test/status", "trigpoint/test/transforms",
         ]  # fmt: skip
         images = list(reader.iter_decoded_messages(topics=["/camera/image"]))
         poses = list(reader.iter_decoded_messages(topics=["trigpoint/test/pose"]))
-    assert len(images) == 16
+        drawn = list(reader.iter_decoded_messages(topics=["trigpoint/test/annotations"]))
+    assert len(images) == len(drawn) == 16
+    drawn_ns = [d.decoded_message.points[0].timestamp.ToNanoseconds() for d in drawn]
+    assert drawn_ns == [i.decoded_message.timestamp.ToNanoseconds() for i in images]
     assert len(poses) >= 15
     assert poses[0].decoded_message.pose.pose.orientation.w is not None
     for recording, out in ((demo.recording, "a.txt"), (log, "b.txt")):

@@ -12,12 +12,14 @@ import pytest
 import zenoh
 
 from tests.conftest import Demo
+from tests.daemon.test_service import run
 from tests.daemon.zenoh_daemon import Camera, get, open_session, running, wait_until
 from trigpoint.errors import ConfigError
 from trigpoint.models.features import FeatureModel
 from trigpoint_db.importers.colmap import read_model
 from trigpointd.config import ZenohConfig, load_config
-from trigpointd.sinks.zenoh import ZenohSink, make_settings
+from trigpointd.session import make_settings
+from trigpointd.sinks.zenoh import ZenohSink
 
 DOC = Path(__file__).parents[2] / "docs" / "security.md"
 pytestmark = [
@@ -53,13 +55,19 @@ def docs_config(certificates: Path, port: int, **tls: Any) -> ZenohConfig:
     return ZenohConfig.model_validate({**tables, "tls": {**tables["tls"], **files, **tls}})
 
 
-def connect_as(name: str, certificates: Path, port: int) -> zenoh.Session:
-    """Connect with the docs' settings for a program."""
+def zenoh_file(name: str, certificates: Path, port: int) -> Path:
+    """Write the docs' settings for a program, beside the certificates."""
     text = block("json5").replace("tls/drone1:7447", f"tls/127.0.0.1:{port}")
     text = text.replace("ground", name)
     for file in ("ca.pem", f"{name}.pem", f"{name}.key"):
         text = text.replace(f'"{file}"', f'"{certificates / file}"')
-    return zenoh.open(zenoh.Config.from_json5(text))
+    path = certificates / f"{name}.json5"
+    path.write_text(text)
+    return path
+
+
+def connect_as(name: str, certificates: Path, port: int) -> zenoh.Session:
+    return zenoh.open(zenoh.Config.from_file(zenoh_file(name, certificates, port)))
 
 
 def see(session: zenoh.Session) -> tuple[list[str], Callable[[], dict[str, list[str]]]]:
@@ -184,6 +192,26 @@ def test_a_file_that_cannot_be_used_is_one_line_at_the_start(
     with pytest.raises(ConfigError, match=message) as caught:
         ZenohSink(docs_config(folder, port), "trigpoint/test")
     assert "\n" not in str(caught.value)
+
+
+def test_check_config_says_in_one_line_which_certificate_cannot_be_used(
+    demo: Demo, certificates: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(certificates, tmp_path / "certificates")
+    config = folder / "trigpointd.toml"
+    source = f'map = "{demo.map}"\nsource = {{ type = "mcap", path = "{demo.recording}" }}\n'
+    config.write_text(source + block("toml"))
+    assert run("trigpointd", "check-config", config).returncode == 0
+    for change, message in (
+        ("cp other/drone1.pem other/drone1.key .", f"refuse {folder}/drone1.pem: "),
+        ("cp ground.key drone1.key", "KEY_VALUES_MISMATCH"),
+        ("rm drone1.key", f"cannot read {folder}/drone1.key"),
+    ):
+        shell(folder, change)
+        done = run("trigpointd", "check-config", config)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert message in done.stderr
+        assert done.stderr.count("\n") == 1
 
 
 def test_an_endpoint_that_is_not_encrypted_is_refused(tmp_path: Path) -> None:

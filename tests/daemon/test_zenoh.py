@@ -264,19 +264,104 @@ def open_router(port: int) -> zenoh.Session:
     return open_session(mode="router", listen__endpoints=[f"tcp/127.0.0.1:{port}"])
 
 
-@pytest.mark.parametrize("mode", ["client", "peer"])
-def test_poses_come_again_when_the_router_does(
-    demo: Demo, model: FeatureModel, port: int, mode: str
-) -> None:
-    config = ZenohConfig.model_validate(
+def endpoint(port: int, mode: str) -> ZenohConfig:
+    return ZenohConfig.model_validate(
         {"mode": mode, "connect": [f"tcp/127.0.0.1:{port}"], "multicast_scouting": False}
     )
-    with running(Camera(picture(demo)), demo.map, model, config):  # no router at the start
+
+
+@pytest.mark.parametrize(
+    ("mode", "problem"), [("client", "no Zenoh router answers"), ("peer", "nobody answers")]
+)
+def test_poses_come_again_when_the_router_does(
+    demo: Demo,
+    model: FeatureModel,
+    port: int,
+    mode: str,
+    problem: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
+    problem += f" at tcp/127.0.0.1:{port}"
+    with running(Camera(picture(demo)), demo.map, model, endpoint(port, mode)) as sink:
+        wait_until(lambda: sink.problem == problem)  # no router at the start
         for _ in range(3):
             with open_router(port) as router:
                 Inbox(router).wait_for_more(3)
+                wait_until(lambda: sink.problem == "")
                 ((is_good, text),) = get(router, "trigpoint/test/map")
                 assert is_good, text
+            wait_until(lambda: sink.problem == problem)
+    said = [record.message for record in caplog.records if record.name.endswith("sinks.zenoh")]
+    assert said == [
+        f"{problem}; publishing once it can be reached", "Zenoh is there; publishing",
+    ] * 3 + [f"{problem}; publishing once it can be reached"]  # fmt: skip
+
+
+def test_a_peer_that_waits_for_others_to_connect_has_no_problem(
+    demo: Demo, model: FeatureModel, port: int
+) -> None:
+    with running(Camera(picture(demo)), demo.map, model, peer(port)) as sink:
+        with connect(port) as session:
+            Inbox(session).wait_for_more(3)
+        with connect(port) as session:
+            Inbox(session).wait_for_more(3)
+        assert sink.problem == ""
+
+
+@pytest.mark.parametrize("mode", ["client", "peer"])
+def test_a_session_closed_under_the_daemon_is_opened_again(
+    demo: Demo,
+    model: FeatureModel,
+    port: int,
+    mode: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
+    sessions, open_ = list[zenoh.Session](), zenoh.open
+
+    def remember(settings: zenoh.Config) -> zenoh.Session:
+        sessions.append(open_(settings))
+        return sessions[-1]
+
+    with open_router(port) as router:
+        monkeypatch.setattr(zenoh, "open", remember)
+        with running(Camera(picture(demo)), demo.map, model, endpoint(port, mode)) as sink:
+            inbox = Inbox(router)
+            for number in range(1, 4):
+                inbox.wait_for_more(3)
+                sessions[-1].close()  # type: ignore[no-untyped-call]
+                wait_until(lambda number=number: len(sessions) > number)  # type: ignore[misc]
+            inbox.wait_for_more(3)
+            wait_until(lambda: sink.problem == "")
+            for key in ("pose", "status", "map"):
+                ((is_good, text),) = get(router, f"trigpoint/test/{key}")
+                assert is_good, text
+    said = [record.message for record in caplog.records if record.name.endswith("sinks.zenoh")]
+    lost = "the Zenoh session was closed; publishing once it can be reached"
+    assert said == [lost, "Zenoh is there; publishing"] * 3
+
+
+def test_a_session_closed_while_the_router_is_away_is_opened_when_it_is_back(
+    demo: Demo, model: FeatureModel, port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sessions, open_ = list[zenoh.Session](), zenoh.open
+
+    def remember(settings: zenoh.Config) -> zenoh.Session:
+        sessions.append(open_(settings))
+        return sessions[-1]
+
+    router = open_router(port)
+    monkeypatch.setattr(zenoh, "open", remember)
+    with running(Camera(picture(demo)), demo.map, model, endpoint(port, "client")) as sink:
+        Inbox(router).wait_for_more(1)
+        router.close()  # type: ignore[no-untyped-call]
+        sessions[-1].close()  # type: ignore[no-untyped-call]
+        wait_until(lambda: "no Zenoh router answers" in sink.problem)
+        with open_router(port) as router:
+            Inbox(router).wait_for_more(3)
+            wait_until(lambda: sink.problem == "")
 
 
 def test_without_a_router_a_client_ends_in_order(

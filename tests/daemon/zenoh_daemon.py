@@ -51,7 +51,9 @@ class Camera:
 
 
 @contextlib.contextmanager
-def running(camera: Camera, map_: Path, model: FeatureModel, zenoh_: ZenohConfig) -> Iterator[None]:
+def running(
+    camera: Camera, map_: Path, model: FeatureModel, zenoh_: ZenohConfig
+) -> Iterator[ZenohSink]:
     """Run a daemon with the base key trigpoint/test; its end is orderly, or the test fails."""
     config = Config(map=map_, source=McapConfig(type="mcap", path=map_), zenoh=zenoh_)
     stop, loops = asyncio.Event(), list[asyncio.AbstractEventLoop]()
@@ -75,7 +77,7 @@ def running(camera: Camera, map_: Path, model: FeatureModel, zenoh_: ZenohConfig
         thread = threading.Thread(target=run)
         thread.start()
         try:
-            yield
+            yield sink
         finally:
             wait_until(lambda: bool(loops or failures))
             with contextlib.suppress(RuntimeError):  # it has ended already

@@ -36,7 +36,7 @@ def test_the_example_has_every_other_setting_and_is_valid() -> None:
     tables = tomllib.loads(text.split("```toml")[1].split("```")[0])
     config = Config.model_validate(tables)
     assert set(tables) == set(Config.model_fields) - {"localizer"}
-    for name in ("source", "camera", "model", "zenoh", "log"):
+    for name in ("source", "camera", "model", "zenoh", "log", "foxglove"):
         assert set(tables[name]) == set(type(getattr(config, name)).model_fields)
     for name in ("requests", "tls"):
         assert set(tables["zenoh"][name]) == set(type(getattr(config.zenoh, name)).model_fields)

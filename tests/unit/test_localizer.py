@@ -67,6 +67,39 @@ def test_frames_are_localized_by_either_generator(
         assert (result.statistics.num_consistent_anchors >= 2) == (generator_name == "anchor_pairs")
 
 
+def test_a_pose_names_the_points_and_anchors_it_rests_on(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    options = LocalizerOptions()
+    result = Localizer(model, reader, options).localize(flight[0][0])
+    assert isinstance(result, Localized)
+    support, statistics = result.support, result.statistics
+    assert len(support.inliers) == statistics.num_points
+    assert support.inliers.sum() == statistics.num_inliers
+    points_cam = result.cam_from_world.apply(support.points3d)
+    errors = np.linalg.norm(points_cam[:, :2] / points_cam[:, 2:] - support.points2d, axis=1)
+    limit = options.max_reprojection_error_px / CAMERA.focal_px
+    np.testing.assert_array_equal(errors < limit, support.inliers)
+
+    names = {reader.anchor(i).name: reader.anchor(i) for i in range(len(reader))}
+    expected = np.array([names[name].cam_from_world.t for name in statistics.anchors])
+    np.testing.assert_array_equal(support.anchors_from_world.t, expected)
+    assert support.anchor_inliers.sum() >= 2 * statistics.num_inliers
+    assert support.anchor_inliers.max() <= statistics.num_inliers
+    assert 2 <= (support.anchor_inliers > 0).sum() <= options.num_refined_anchors
+
+
+def test_a_refused_pose_names_them_too(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    options = LocalizerOptions(max_position_std_m=2e-6)
+    result = Localizer(model, reader, options).localize(flight[0][0])
+    assert isinstance(result, Lost)
+    assert result.reason is Reason.HIGH_UNCERTAINTY
+    assert result.support is not None
+    assert result.support.inliers.sum() == result.statistics.num_inliers
+
+
 def test_the_same_frame_gives_the_same_pose(
     model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
 ) -> None:

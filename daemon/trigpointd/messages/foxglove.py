@@ -14,18 +14,19 @@ from trigpoint.camera_messages import Image
 from trigpoint.frame import Frame
 from trigpointd.sources.base import Channel, Message
 
-_FRAME_ID = "camera"
+CAMERA_FRAME = "camera"
 _DISTORTION = {"OPENCV_FISHEYE": "kannala_brandt", "FULL_OPENCV": "rational_polynomial"}
 
 
-def _channel(topic: str, kind: Any) -> Channel:
+def make_channel(topic: str, kind: Any) -> Channel:
+    """Describe a topic for messages of a kind of Foxglove's."""
     schema = build_file_descriptor_set(kind).SerializeToString()
     return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", schema)
 
 
-_CALIBRATION = _channel("/camera/calibration", CameraCalibration)
-_RAW = _channel("/camera/image", RawImage)
-_COMPRESSED = _channel("/camera/image", CompressedImage)
+_CALIBRATION = make_channel("/camera/calibration", CameraCalibration)
+_RAW = make_channel("/camera/image", RawImage)
+_COMPRESSED = make_channel("/camera/image", CompressedImage)
 
 
 def calibration_message(camera: Camera, log_time_ns: int) -> Message:
@@ -34,7 +35,7 @@ def calibration_message(camera: Camera, log_time_ns: int) -> Message:
     if camera.model in _DISTORTION:
         model, distortion = _DISTORTION[camera.model], list(camera.distortion)
     message = CameraCalibration(
-        frame_id=_FRAME_ID,
+        frame_id=CAMERA_FRAME,
         width=camera.width,
         height=camera.height,
         distortion_model=model,
@@ -61,7 +62,7 @@ def image_message(image: Image, log_time_ns: int, sequence: int) -> Message:
                 data=image.data,
             ),
         )
-    message.frame_id = _FRAME_ID
+    message.frame_id = CAMERA_FRAME
     message.timestamp.FromNanoseconds(image.time_ns)
     return Message(channel, message.SerializeToString(), log_time_ns, log_time_ns, sequence)
 
@@ -70,4 +71,4 @@ def gray_image(frame: Frame) -> Image:
     """Return the gray levels of a frame: all that a replay needs of its pixels."""
     height, width = frame.image.shape
     data = frame.image.tobytes()
-    return Image(frame.time_ns, _FRAME_ID, data, "mono8", width, height, width)
+    return Image(frame.time_ns, CAMERA_FRAME, data, "mono8", width, height, width)

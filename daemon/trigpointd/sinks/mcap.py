@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,14 +14,13 @@ from mcap.writer import CompressionType, Writer
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError, SourceError
 from trigpoint.frame import Frame
-from trigpointd.messages.cdr import POSE_SCHEMA, POSE_TYPE
 from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
+from trigpointd.messages.published import Published
 from trigpointd.pipeline import Output
 from trigpointd.sinks.log_files import cannot_write
 from trigpointd.sources.base import Captured, Channel, Message
 
 _CHUNK_BYTES = 256 * 1024
-_STATUS_SCHEMA = b'{"type": "object"}'
 
 
 class McapLog:
@@ -61,10 +60,7 @@ class McapLog:
         self.path = path
         self._frames = frames
         self._stream = _open(path, overwrite=overwrite)
-        self._pose = Channel(f"{base_key}/pose", "cdr", POSE_TYPE, "ros2msg", POSE_SCHEMA.encode())
-        self._status = Channel(
-            f"{base_key}/status", "json", "trigpoint.Status", "jsonschema", _STATUS_SCHEMA
-        )
+        self._published = Published(base_key)
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self._channel_ids: dict[Channel, int] = {}
         self._calibration: Message | None = None
@@ -90,14 +86,12 @@ class McapLog:
         """Whether nobody can find the file any more."""
         return os.fstat(self._stream.fileno()).st_nlink == 0
 
-    def publish(self, output: Output) -> None:
-        """Write what the frame came from, if asked to, the pose and the status."""
-        captured, time_ns = output.captured, output.captured.log_time_ns
+    def publish(self, output: Output, visuals: Iterable[Message] = ()) -> None:
+        """Write what the frame came from, if asked to, the pose, the status and what is drawn."""
         if self._frames:
-            self._write_input(captured)
-        if output.pose is not None:
-            self._write(Message(self._pose, output.pose, time_ns, time_ns))
-        self._write(Message(self._status, output.status, time_ns, time_ns))
+            self._write_input(output.captured)
+        for message in (*self._published.of(output), *visuals):
+            self._write(message)
 
     def flush(self) -> None:
         """Close the chunk in progress and wait until the disk has it."""

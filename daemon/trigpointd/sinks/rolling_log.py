@@ -11,9 +11,11 @@ from pathlib import Path
 from trigpoint.errors import ConfigError, SourceError, TrigpointError
 from trigpoint.output import check_output
 from trigpointd.config import LogConfig
+from trigpointd.messages.visuals import Visuals
 from trigpointd.pipeline import Output
 from trigpointd.sinks.log_files import LogFiles
 from trigpointd.sinks.mcap import McapLog
+from trigpointd.sources.base import Message
 
 _log = logging.getLogger(__name__)
 _FIRST_DELAY_S, _MAX_DELAY_S = 1.0, 30.0
@@ -65,6 +67,7 @@ class RollingLog:
         self.num_unlogged = 0
         self._config, self._base_key, self._about, self._clock = config, base_key, about, clock
         self._files = LogFiles(config.path)
+        self._visuals = Visuals(base_key) if config.visuals else None
         self._part: McapLog | None = None
         self._last_path: Path | None = None
         self._num_unflushed = 0
@@ -93,11 +96,21 @@ class RollingLog:
         self._num_unflushed += 1
         with self._pausing():
             part = self._part or self._begin(self._files.next_part())
-            part.publish(output)
+            part.publish(output, self._draw(output))
             if self.problem or self.time_to_flush_s == 0:
                 self._flush(part)
             if self._is_full(part):
                 self._end(part)
+
+    def _draw(self, output: Output) -> Sequence[Message]:
+        if self._visuals is None:
+            return ()
+        try:
+            return self._visuals.draw(output)
+        except Exception:  # the frames and poses matter more
+            _log.exception("what viewers show is left out of the log from here on")
+            self._visuals = None
+            return ()
 
     def flush(self) -> None:
         """Wait until the disk has what was written."""
@@ -175,10 +188,10 @@ class RollingLog:
     def _pausing(self) -> Iterator[None]:
         try:
             yield
-        except TrigpointError as error:
+        except Exception as error:  # a mistake of ours, too, must not end the thread
             self._pause(error)
 
-    def _pause(self, error: TrigpointError) -> None:
+    def _pause(self, error: Exception) -> None:
         if self._part is not None:
             with contextlib.suppress(SourceError):
                 self._part.close()
@@ -188,7 +201,10 @@ class RollingLog:
         if self.problem:
             self._delay_s = min(2 * self._delay_s, _MAX_DELAY_S)
         else:
-            _log.error("recording pauses: %s; it goes on as soon as it can", error)
+            unexpected = None if isinstance(error, TrigpointError) else error
+            _log.error(
+                "recording pauses: %s; it goes on as soon as it can", error, exc_info=unexpected
+            )
             self._delay_s = _FIRST_DELAY_S
-        self.problem = str(error)
+        self.problem = str(error) or type(error).__name__
         self._retry_s = self._clock() + self._delay_s

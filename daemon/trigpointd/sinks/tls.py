@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ssl
+from pathlib import Path
 from typing import Any
 
 from trigpoint.errors import ConfigError
@@ -36,7 +37,7 @@ _REQUEST = {**_GET_LAST, "id": "request", "key_exprs": ["**"]}
 
 def make_tls_settings(config: TlsConfig) -> dict[str, Any]:
     """Return Zenoh's settings by their paths; a file that cannot be used is an error."""
-    _check(config)
+    check_certificates(config.ca, config.certificate, config.private_key)
     own = {"certificate": str(config.certificate), "private_key": str(config.private_key)}
     return {
         "transport/link/protocols": ["tls"],
@@ -76,32 +77,37 @@ def _access_control(config: TlsConfig) -> dict[str, Any]:
     }
 
 
-def _check(config: TlsConfig) -> None:
-    """Shake hands with ourselves: Zenoh takes an expired or foreign certificate without a word."""
-    for path in (config.ca, config.certificate, config.private_key):
+def check_certificates(
+    ca: Path, certificate: Path, private_key: Path, setting: str = "zenoh.tls"
+) -> None:
+    """Shake hands with ourselves: Zenoh takes an expired or foreign certificate without a word.
+
+    `setting` is where the files are named.
+    """
+    for path in (ca, certificate, private_key):
         try:
             path.read_bytes()
         except OSError as error:
-            raise ConfigError(f"zenoh.tls: cannot read {path}: {error.strerror}") from error
+            raise ConfigError(f"{setting}: cannot read {path}: {error.strerror}") from error
     server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     client = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname = False  # peers ask for the name that they connect to
     try:
-        client.load_verify_locations(config.ca)
+        client.load_verify_locations(ca)
     except ssl.SSLError as error:
-        raise ConfigError(f"zenoh.tls: {config.ca} is no certificate in PEM") from error
+        raise ConfigError(f"{setting}: {ca} is no certificate in PEM") from error
     try:
-        server.load_cert_chain(config.certificate, config.private_key)
+        server.load_cert_chain(certificate, private_key)
     except ssl.SSLError as error:
         raise ConfigError(
-            f"zenoh.tls: {config.certificate} and {config.private_key} are no certificate and its "
+            f"{setting}: {certificate} and {private_key} are no certificate and its "
             f"private key in PEM: {error.reason or error}"
         ) from error
     try:
         _shake_hands(server, client)
     except ssl.SSLCertVerificationError as error:
         raise ConfigError(
-            f"zenoh.tls: peers that trust {config.ca} will refuse {config.certificate}: "
+            f"{setting}: peers that trust {ca} will refuse {certificate}: "
             f"{error.verify_message}; make a new certificate (docs/security.md)"
         ) from error
 

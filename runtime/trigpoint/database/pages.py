@@ -59,7 +59,7 @@ def read_meta(fd: int, slot: int) -> Meta:
     # The file's size after the root: a writer makes the file longer before it commits.
     size, wanted = os.fstat(fd).st_size, meta.num_pages * page_bytes
     if size < wanted or meta.page_bytes != page_bytes:
-        raise DamageError(f"cut short, {size} of {wanted} bytes are there")
+        raise DamageError(f"cut short: it should have {wanted} bytes")
     return meta
 
 

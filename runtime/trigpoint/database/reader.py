@@ -14,7 +14,7 @@ from trigpoint.camera import Camera
 from trigpoint.database import schema
 from trigpoint.database.pages import DamageError
 from trigpoint.database.ranking import POOL, PREFERENCE, choose_diverse, find_largest
-from trigpoint.database.snapshot import Snapshot, reporting
+from trigpoint.database.snapshot import OVERWRITTEN, LockFileError, Snapshot, reporting
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import (
     Anchor,
@@ -39,6 +39,8 @@ class MapReader:
     def __init__(self, path: Path, snapshot: Snapshot) -> None:
         self._path = path
         self._snapshot: Snapshot | None = snapshot
+        self._metadata, self._file = snapshot.metadata, snapshot.file
+        self._is_closed = False
 
     @classmethod
     def open(cls, path: Path, model: ModelIdentity | None = None) -> Self:
@@ -49,7 +51,8 @@ class MapReader:
     @property
     def _current(self) -> Snapshot:
         if self._snapshot is None:
-            raise DatabaseError(f"{self._path}: this reader is closed")
+            why = "this reader is closed" if self._is_closed else OVERWRITTEN
+            raise DatabaseError(f"{self._path}: {why}")
         return self._snapshot
 
     @contextmanager
@@ -64,25 +67,25 @@ class MapReader:
     @property
     def model(self) -> ModelIdentity:
         """Which network made the features."""
-        return self._current.metadata.model
+        return self._metadata.model
 
     @property
     def generation(self) -> int:
         """Rises with each commit."""
-        return self._current.metadata.generation
+        return self._metadata.generation
 
     @property
     def pose_noise(self) -> PoseNoise | None:
         """How well the poses of the map agree; None where that was not measured."""
-        return self._current.metadata.pose_noise
+        return self._metadata.pose_noise
 
     @property
     def sessions(self) -> tuple[Session, ...]:
         """The surveys that images of the map are of, or were."""
-        return self._current.metadata.sessions
+        return self._metadata.sessions
 
     def __len__(self) -> int:
-        return self._current.metadata.num_images
+        return self._metadata.num_images
 
     def names(self) -> list[str]:
         """Return the names of all images, by index."""
@@ -198,17 +201,41 @@ class MapReader:
 
         Where that one cannot be used, the error is raised and the old one stays.
         """
-        old = self._current
+        if self._is_closed:
+            raise DatabaseError(f"{self._path}: this reader is closed")
+        before = self._file, self._metadata
         with reporting(self._path):
-            if old.is_newest(self._path):
+            if self._snapshot is not None and self._snapshot.is_newest(self._path):
                 return False
-            new = Snapshot(self._path, old.metadata.model)
-        if (new.file, new.metadata.generation) == (old.file, old.metadata.generation):
+            new = self._open_newest()
+        if self._snapshot is not None and new.state == self._snapshot.state:
             new.close()
-            return False
-        self._snapshot = new
-        old.close()
-        return True
+        else:
+            self._let_go()
+            self._snapshot, self._metadata, self._file = new, new.metadata, new.file
+        return (self._file, self._metadata) != before
+
+    def _open_newest(self) -> Snapshot:
+        newest = self._try_newest()
+        if newest is None:
+            # Overwritten in place. LMDB forgets what it knew of the file with its last user.
+            self._let_go()
+            newest = Snapshot(self._path, self._metadata.model)
+        return newest
+
+    def _try_newest(self) -> Snapshot | None:
+        """Open the newest snapshot, unless the lock file says that it is another one."""
+        try:
+            newest = Snapshot(self._path, self._metadata.model)
+        except LockFileError:
+            status = self._path.stat()
+            if self._file != (status.st_dev, status.st_ino):
+                raise
+            return None
+        if newest.is_behind:
+            newest.close()
+            return None
+        return newest
 
     def verify(self) -> list[str]:
         """Check everything, whether checked before or not, and list what is wrong."""
@@ -232,9 +259,13 @@ class MapReader:
 
     def close(self) -> None:
         """Close the map."""
+        self._let_go()
+        self._is_closed = True
+
+    def _let_go(self) -> None:
         if self._snapshot is not None:
             self._snapshot.close()
-            self._snapshot = None
+        self._snapshot = None
 
     def __enter__(self) -> Self:
         return self

@@ -123,9 +123,9 @@ class Metadata:
         return json.dumps(fields, default=date.isoformat).encode()
 
     @classmethod
-    def decode(cls, payload: memoryview) -> Metadata:
+    def decode(cls, payload: bytes) -> Metadata:
         """Read JSON of this version."""
-        fields = json.loads(bytes(payload))
+        fields = json.loads(payload)
         if (found := fields.pop("format")) != FORMAT:
             raise DatabaseError(
                 f"a map of format {found}, and this version reads format {FORMAT}; "
@@ -247,6 +247,8 @@ def decode_features(
 ) -> tuple[Array32, NDArray[np.int8]]:
     """Read keypoints (N, 2) in px and quantized descriptors (N, D)."""
     split = 4 * (image.num_keypoints - len(image.first_keypoints))
+    if len(payload) != split + dim * image.num_keypoints:
+        raise DamageError(f"{image.name!r} has features that are not its own")
     others = np.frombuffer(payload[:split], "<u2").reshape(-1, 2)
     fixed = np.concatenate([image.first_keypoints, others])
     keypoints = (fixed * _keypoint_step_px(image.camera) - 0.5).astype(np.float32)

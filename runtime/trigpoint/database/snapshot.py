@@ -20,6 +20,7 @@ from trigpoint.errors import DatabaseError
 from trigpoint.frame import ModelIdentity
 
 MAX_MAP_BYTES = 2**37  # of address space, not of disk; arm64 kernels may offer no more than 2**39
+OVERWRITTEN = "overwritten while open (replace maps by renaming, not in place)"
 LOCK_BYTES = 16_384  # more than the lock file of LMDB's 126 readers needs
 
 # LMDB wants one environment for a file in a process: readers and a writer share it. The keys are
@@ -123,6 +124,10 @@ def _reserve_lock(path: Path) -> None:
         os.close(fd)
 
 
+class LockFileError(DatabaseError):
+    """LMDB's lock file counts the commits of another file, or of what this one held before."""
+
+
 @contextmanager
 def reporting(path: Path) -> Iterator[None]:
     """Name the map, and what to do, in every error: ours, LMDB's, the operating system's."""
@@ -151,24 +156,30 @@ class Snapshot:
 
     def __init__(self, path: Path, model: ModelIdentity | None = None) -> None:
         with ExitStack() as stack:
+            # The traceback of an error may hold a snapshot, which must not hold the environment.
+            stack.callback(vars(self).clear)
             if not stat.S_ISREG(path.stat().st_mode):
                 raise DatabaseError("not a regular file; give the path of a map file")
             self._fd = os.open(path, os.O_RDONLY)
             stack.callback(os.close, self._fd)
             status = os.fstat(self._fd)
             self.file = status.st_dev, status.st_ino
+            self._changed_ns = status.st_ctime_ns
             for slot in (0, 1):
                 read_meta(self._fd, slot)  # before LMDB sees the file
             self._environment = share_environment(path, self._fd)
             self._txn, meta = self._begin()
             stack.callback(self._txn.abort)
+            # The file holds a later commit: one is in progress, or another map was copied over it.
+            self.is_behind = self._newest_commit() > self._txn.id()
             self._is_kept = self._environment.info()["num_readers"] > 0
             self._tree = Tree(self._fd, meta)
             self._checked: set[bytes] = set()
             self._tree.check(schema.METADATA_KEY)
             if self._txn.get(schema.METADATA_KEY) is None:
                 raise DatabaseError(NOT_A_MAP)
-            self.metadata = schema.Metadata.decode(self.get(schema.METADATA_KEY))
+            self._metadata = bytes(self._read(schema.METADATA_KEY))
+            self.metadata = schema.Metadata.decode(self._metadata)
             if model is not None and model != self.metadata.model:
                 raise DatabaseError(
                     f"made with {_describe(self.metadata.model)}, not with {_describe(model)}; "
@@ -183,13 +194,27 @@ class Snapshot:
             if meta.commit == txn.id():
                 return txn, meta
             txn.abort()  # a writer has committed twice since
-        raise DatabaseError(
+        raise LockFileError(
             "its lock file belongs to a map that was here before and is still in use, or its first "
             "pages are damaged; remove the lock file"
         )
 
+    @property
+    def state(self) -> tuple[object, ...]:
+        """Differs between snapshots between which the file was written to."""
+        return self.file, self._txn.id(), self._changed_ns
+
     def get(self, key: bytes) -> memoryview:
         """Return a value where it lies; its checksum is compared the first time."""
+        changed_ns = os.fstat(self._fd).st_ctime_ns
+        if changed_ns != self._changed_ns:  # by a commit, which leaves this snapshot as it was?
+            self.forget_checks()
+            if self._read(schema.METADATA_KEY) != self._metadata:
+                raise DamageError(OVERWRITTEN)
+            self._changed_ns = changed_ns
+        return self._read(key)
+
+    def _read(self, key: bytes) -> memoryview:
         self._tree.check(key)
         payload = schema.unseal(key, self._txn.get(key), check=key not in self._checked)
         self._checked.add(key)
@@ -219,10 +244,10 @@ class Snapshot:
             )
 
     def is_newest(self, path: Path) -> bool:
-        """Whether the path still leads to this file, and no commit has followed."""
+        """Whether the path still leads to this file, and nothing was written to it since."""
         status = path.stat()
-        same_file = (status.st_dev, status.st_ino) == self.file
-        return same_file and self._newest_commit() == self._txn.id()
+        found = (status.st_dev, status.st_ino), status.st_ctime_ns
+        return found == (self.file, self._changed_ns) and self._newest_commit() == self._txn.id()
 
     def _newest_commit(self) -> int:
         return max(read_meta(self._fd, slot).commit for slot in (0, 1))

@@ -43,6 +43,8 @@ class RefinedPose:
     Parameters
     ----------
     cam_from_world : Rigid3
+    points3d : (M, 3) float64
+        The latent points.
     covariance : (6, 6) float64
         Of (dc, dtheta) as `trigpoint.frame.Localized` defines them.
     inliers : (M,) bool
@@ -53,6 +55,7 @@ class RefinedPose:
     """
 
     cam_from_world: Rigid3
+    points3d: Array
     covariance: Array
     inliers: NDArray[np.bool_]
     point_covariance: Array
@@ -120,7 +123,11 @@ def refine_jointly(
     if inliers.sum() < MIN_POINTS:
         return None
     return RefinedPose(
-        end.cam_from_world, second.covariance(), inliers, second.points.unbounded_covariance()
+        end.cam_from_world,
+        end.points3d,
+        second.covariance(),
+        inliers,
+        second.points.unbounded_covariance(),
     )
 
 
