@@ -42,6 +42,7 @@ from trigpoint_db.cli_maps import app as maps
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths
 from trigpoint_db.extraction import NetworkFiles, open_crew
+from trigpoint_db.fleet import cli as fleet_cli
 from trigpoint_db.importers import cli as importers_cli
 from trigpoint_db.importers.cli import Format, Images, Poses, Source
 from trigpoint_db.importers.colmap import read_model
@@ -73,6 +74,7 @@ app = typer.Typer(
 )
 app.add_typer(maps)  # on the same level
 app.add_typer(importers_cli.app)
+app.add_typer(fleet_cli.app)
 
 
 @app.callback()
