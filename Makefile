@@ -17,7 +17,7 @@ LIB = $(DESTDIR)$(PREFIX)/lib
 SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
 .PHONY: demo test kill-test test-oak test-systemd test-v4l2 check golden
-.PHONY: bench bench-models bench-localizer bench-daemon soak wheel-test clean
+.PHONY: bench bench-building bench-models bench-localizer bench-daemon soak wheel-test clean
 .PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
@@ -77,6 +77,12 @@ bench: $(READY)
 	  $(BIN)/python benchmarks/stage_times.py $(DEMO)/map.tpmap \
 	    --images $(DEMO)/flight --queries $(DEMO)/queries.txt; \
 	fi
+
+# Images a second that maps are built with, on the same data.
+bench-building: $(READY)
+	test -d $(KITCHEN) || test -d $(DEMO)/survey || $(BIN)/trigpoint-db demo $(DEMO)
+	$(BIN)/python -m benchmarks.building \
+	  $(if $(wildcard $(KITCHEN)),$(KITCHEN),$(DEMO))
 
 # Our networks beside RootSIFT and, where its checkout is named, EdgePoint2, which needs torch:
 # make bench-models EDGEPOINT2=../EdgePoint2 FP32=build/fp32

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
-from trigpoint.database.replacing import new_map
+from trigpoint.database.replacing import partial_map, resumable_map
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError
-from trigpoint.frame import Frame, Session
-from trigpoint.images import read_gray
+from trigpoint.frame import Frame, LocalFeatures, Session
 from trigpoint.models.features import FeatureModel
+from trigpoint_db.extraction import Crew, EncodedImage, extract_by_workers, extract_features
 from trigpoint_db.importers.base import PosedImage
-from trigpoint_db.messages import read_image
 
-COMMIT_EVERY = 100  # images of a new map; until then they are in memory
+COMMIT_EVERY = 100  # images of a new map; what a crash costs at the most
 
 
 def select_images(images: Sequence[PosedImage], names: Sequence[str]) -> list[PosedImage]:
@@ -58,11 +60,7 @@ def check_files(names: Iterable[str], images: Path) -> None:
 
 def read_frame(images: Path, name: str, camera: Camera) -> Frame:
     """Read an image that a camera has taken, from a folder or from a recording."""
-    try:
-        gray = read_image(images, name) if images.is_file() else read_gray(images / name)
-        return Frame(gray, camera, name=name)
-    except ConfigError as error:
-        raise ConfigError(f"{images}: {name}: {error}") from error
+    return EncodedImage.read(images, name, camera).decode()
 
 
 def build_map(
@@ -73,17 +71,43 @@ def build_map(
     *,
     max_keypoints: int = 1024,
     session: Session | None = None,
+    crew: Crew | None = None,
+    resume: bool = False,
 ) -> int:
     """Write a new map; it appears under its name when it is complete. Returns the image count.
 
-    The images are read from `folder` by `read_frame`.
+    The images are read from `folder` by `read_frame`. The same images in the same order give the
+    same bytes, whoever does the work. With `resume`, what an interrupted build of the same images
+    has committed is taken over; an interrupted one leaves the same records then.
     """
-    with new_map(path, model.identity) as writer:
-        for image in images:
-            _add(writer, image, folder, model, max_keypoints, session)
+    with resumable_map(path, model.identity, resume=resume) as writer:
+        remaining = iter(images)
+        if len(writer):
+            _pass_over(remaining, partial_map(path), session)
+        for image, features in _extract(remaining, folder, model, max_keypoints, crew):
+            writer.add(image.name, image.camera, image.cam_from_world, features, session)
             if len(writer) % COMMIT_EVERY == 0:
                 writer.commit()
         return len(writer)
+
+
+def _pass_over(images: Iterator[PosedImage], path: Path, session: Session | None) -> None:
+    """Take off the first images, which a map holds already; others in their places are an error."""
+    with MapReader.open(path) as reader:
+        names, sessions = reader.names(), reader.sessions_by_index()
+        for index, name in enumerate(names):
+            camera, pose = reader.view(index)
+            image = next(images, None)
+            if (
+                image is None
+                or (image.name, image.camera, session) != (name, camera, sessions[index])
+                or not np.allclose(image.cam_from_world.R, pose.R, rtol=0, atol=1e-9)
+                or not np.allclose(image.cam_from_world.t, pose.t, rtol=1e-9, atol=0)
+            ):
+                raise ConfigError(
+                    f"{path} was begun with other images, poses or sessions: its image {index} is "
+                    f"{name!r}; give those again, or remove it to begin anew"
+                )
 
 
 def append_map(
@@ -94,24 +118,34 @@ def append_map(
     *,
     max_keypoints: int = 1024,
     session: Session | None = None,
+    crew: Crew | None = None,
 ) -> int:
     """Add images to a map, each of which is there for good once it is added. Returns how many."""
     with MapWriter.open(path, model.identity) as writer:
         before = len(writer)
-        for image in images:
-            _add(writer, image, folder, model, max_keypoints, session)
+        for image, features in _extract(images, folder, model, max_keypoints, crew):
+            writer.add(image.name, image.camera, image.cam_from_world, features, session)
             writer.commit()
         return len(writer) - before
 
 
-def _add(
-    writer: MapWriter,
-    image: PosedImage,
+def _extract(
+    images: Iterable[PosedImage],
     folder: Path,
     model: FeatureModel,
     max_keypoints: int,
-    session: Session | None,
-) -> None:
-    frame = read_frame(folder, image.name, image.camera)
-    features = model.extract(frame.image, max_keypoints)
-    writer.add(image.name, image.camera, image.cam_from_world, features, session)
+    crew: Crew | None,
+) -> Iterator[tuple[PosedImage, LocalFeatures]]:
+    """Pair images with their features; few more than are in work are read ahead."""
+    waiting: deque[PosedImage] = deque()
+
+    def read() -> Iterator[EncodedImage]:
+        for image in images:
+            waiting.append(image)
+            yield EncodedImage.read(folder, image.name, image.camera)
+
+    if crew is None:
+        extracted = extract_features(read(), model, max_keypoints)
+    else:
+        extracted = extract_by_workers(read(), crew, max_keypoints)
+    return ((waiting.popleft(), features) for features in extracted)

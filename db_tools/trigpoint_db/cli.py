@@ -8,8 +8,9 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,6 +41,8 @@ from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.cli_maps import app as maps
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths
+from trigpoint_db.extraction import NetworkFiles, open_crew
+from trigpoint_db.fleet import cli as fleet_cli
 from trigpoint_db.importers import cli as importers_cli
 from trigpoint_db.importers.cli import Format, Images, Poses, Source
 from trigpoint_db.importers.colmap import read_model
@@ -71,6 +74,7 @@ app = typer.Typer(
 )
 app.add_typer(maps)  # on the same level
 app.add_typer(importers_cli.app)
+app.add_typer(fleet_cli.app)
 
 
 @app.callback()
@@ -109,6 +113,13 @@ def build(
     skip_existing: Annotated[
         bool, typer.Option("--skip-existing", help="Leave out images that the map has.")
     ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a build that was interrupted.")
+    ] = False,
+    jobs: Annotated[int, typer.Option(help="Processes that extract features.", min=1)] = 1,
+    cluster: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, to use its workers.")
+    ] = None,
     session: SessionName = None,
     date: SessionDate = None,
     keypoints: Annotated[int, typer.Option(help="At most so many an image.", min=50)] = 1024,
@@ -138,12 +149,25 @@ def build(
     if append:
         posed = select_new(posed, map_, skip_existing=skip_existing)
     check_files((image.name for image in posed), dataset.images)
-    write = append_map if append else build_map
+    if append and resume:
+        raise ConfigError("an interrupted --append goes on with --append --skip-existing")
+    write = append_map if append else partial(build_map, resume=resume)
     network = FeatureModel.load(model, retrieval=retrieval)
-    images_to_map = track(posed, "mapping", len(posed))
-    count = write(
-        map_, images_to_map, dataset.images, network, max_keypoints=keypoints, session=survey
-    )
+    files = NetworkFiles(model, retrieval, network.identity)
+    with (
+        hint_at_resuming(append=append),
+        open_crew(jobs, cluster, files) as crew,
+        closing(track(posed, "mapping", len(posed))) as tracked,
+    ):
+        count = write(
+            map_,
+            tracked,
+            dataset.images,
+            network,
+            max_keypoints=keypoints,
+            session=survey,
+            crew=crew,
+        )
     noise = calibrate_map(map_, network, track_calibration)
     size = map_.stat().st_size
     if as_json:
@@ -155,6 +179,17 @@ def build(
         print(
             f"{map_}: {count} images added{unposed}, {size / 1e6:.1f} MB; {describe_noise(noise)}"
         )
+
+
+@contextmanager
+def hint_at_resuming(*, append: bool) -> Iterator[None]:
+    """Say after an interruption how the command goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        how = "--skip-existing" if append else "--resume"
+        print(f"trigpoint-db: interrupted; the same command goes on with {how}", file=sys.stderr)
+        raise
 
 
 @app.command()

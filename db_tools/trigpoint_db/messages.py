@@ -9,11 +9,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 from mcap.reader import SeekingReader
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoderFactory
 from mcap_ros2.decoder import DecoderFactory as RosDecoderFactory
-from numpy.typing import NDArray
 
 from trigpoint.camera_messages import Calibration, Image
 from trigpoint.errors import SourceError, TrigpointError
@@ -140,17 +138,14 @@ def image_name(message: Message) -> str:
     return f"{message.topic}/{message.log_time_ns}"
 
 
-def read_image(path: Path, name: str) -> NDArray[np.uint8]:
-    """Decode one image of a recording to gray levels (H, W)."""
+def read_image(path: Path, name: str) -> Image:
+    """Read one image of a recording, as it was sent."""
     topic, _, time = name.rpartition("/")
     time_ns = int(time) if time.isdecimal() else -1
     recording = _open(path)
     if topic in recording.topics_of(IMAGES):
         for image in recording.read(parse_image, [topic], time_ns, time_ns + 1):
-            try:
-                return image.gray()
-            except SourceError as error:
-                raise SourceError(f"{path}: {name}: {error}") from error
+            return image
     raise SourceError(f"{path} has no image {name}")
 
 

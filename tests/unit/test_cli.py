@@ -12,6 +12,8 @@ import pytest
 
 from tests.conftest import Demo
 from tests.unit.conftest import Run
+from trigpoint.database.writer import MapWriter
+from trigpoint.models.features import FeatureModel
 from trigpoint_db.demo import CAMERA
 from trigpoint_db.importers.colmap import read_model, write_model
 from trigpoint_db.poses import read_poses
@@ -141,16 +143,26 @@ def test_a_recording_needs_cameras_for_its_images(run: Run, place: Path) -> None
     assert not out.exists()
 
 
-def test_what_a_killed_build_left_is_removed_by_the_next(run: Run, place: Path) -> None:
+def test_what_a_killed_command_left_is_removed_by_the_next(run: Run, place: Path) -> None:
     ended = subprocess.Popen(["true"])
     ended.wait()
-    leftover = place / f"m.tpmap.{ended.pid}.partial"
+    leftover = place / f"s.tpmap.{ended.pid}.partial"
     leftover.write_bytes(b"half a map")
-    of_another_build = place / f"m.tpmap.{os.getppid()}.partial"
-    of_another_build.write_bytes(b"half a map")
+    of_another = place / f"s.tpmap.{os.getppid()}.partial"
+    of_another.write_bytes(b"half a map")
     assert run(*build(place))[0] == 0
+    everywhere = "--box=-9,-9,-9,9,9,9"
+    assert run("split", place / "m.tpmap", everywhere, "-o", place / "s.tpmap")[0] == 0
     assert not leftover.exists()
-    assert of_another_build.exists()
+    assert of_another.exists()
+
+
+def test_a_build_killed_before_its_first_image_is_begun_anew(
+    run: Run, place: Path, model: FeatureModel
+) -> None:
+    MapWriter.create(place / "m.tpmap.partial", model.identity).close()
+    assert run(*build(place))[0] == 0
+    assert not list(place.glob("m.tpmap.*"))
 
 
 def test_sigterm_leaves_nothing_half_built(place: Path) -> None:
@@ -158,7 +170,7 @@ def test_sigterm_leaves_nothing_half_built(place: Path) -> None:
         [sys.executable, "-m", "trigpoint_db.cli", *map(str, build(place))],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    while process.poll() is None and not list(place.glob("m.tpmap.*.partial")):
+    while process.poll() is None and not list(place.glob("m.tpmap.partial")):
         time.sleep(0.01)
     process.terminate()
     process.wait(20)

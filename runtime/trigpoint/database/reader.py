@@ -196,6 +196,14 @@ class MapReader:
                 best = best[choose_diverse(scores[best], alike @ alike.T, k, diversity)]
         return best, similarities[best]
 
+    def copy_to(self, fd: int) -> None:
+        """Write the snapshot to an empty file, as a map of its own.
+
+        What two snapshots of a file have in common lies in the same places of their copies.
+        """
+        with self._reading() as snapshot:
+            snapshot.copy_to(fd)
+
     def refresh(self) -> bool:
         """Move to the newest snapshot, also of another file renamed into place; True if it differs.
 

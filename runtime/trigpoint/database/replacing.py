@@ -10,8 +10,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from trigpoint.database.reader import MapReader
-from trigpoint.database.snapshot import put_in_place
-from trigpoint.database.writer import MapWriter
+from trigpoint.database.snapshot import put_in_place, reporting
+from trigpoint.database.writer import MapWriter, keep_writers_out
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import ModelIdentity
 
@@ -30,6 +30,43 @@ def new_map(path: Path, model: ModelIdentity) -> Iterator[MapWriter]:
         partial.rename(path)
 
 
+def partial_map(path: Path) -> Path:
+    """Name the file in which a map grows that `resumable_map` makes."""
+    return path.with_name(path.name + ".partial")
+
+
+@contextmanager
+def resumable_map(path: Path, model: ModelIdentity, *, resume: bool) -> Iterator[MapWriter]:
+    """Write a map that is there when it is complete, and whose commits outlive the process.
+
+    They stay in `partial_map`, a map of its own. With `resume` the writer goes on with them;
+    without, they are an error.
+    """
+    _refuse_existing(path)
+    partial = partial_map(path)
+    with _open_partial(partial, model) as writer:
+        if len(writer) and not resume:
+            raise DatabaseError(
+                f"{partial} holds {len(writer)} images of a build that was interrupted; go on with "
+                "--resume, or remove it"
+            )
+        try:
+            yield writer
+        except BaseException:
+            if writer.generation == 0:  # nothing to go on with
+                _remove_map(partial)
+            raise
+    _refuse_existing(path)
+    partial.rename(path)
+    _remove_map(partial)
+
+
+def _open_partial(partial: Path, model: ModelIdentity) -> MapWriter:
+    if partial.exists():
+        return MapWriter.open(partial, model)
+    return MapWriter.create(partial, model)
+
+
 def compact_map(path: Path) -> None:
     """Rewrite a map without the pages that no image needs any more, as LMDB does.
 
@@ -45,6 +82,35 @@ def compact_map(path: Path) -> None:
     with closing(MapWriter.open(path, model)) as writer, _partial_file(path) as partial:
         writer.copy_to(partial)
         put_in_place(partial, path)
+
+
+def install_map(new: Path, path: Path) -> None:
+    """Put a whole map in the place of another one, or of none; on disk when this returns.
+
+    Readers keep the old one until they refresh. A new one that is damaged is an error, and so is an
+    old one that a writer has open; the old one stays then.
+    """
+    path = path.resolve()
+    with MapReader.open(new) as reader:
+        if problems := reader.verify():
+            raise DatabaseError(f"{new}: is damaged and is not taken: {problems[0]}")
+    with reporting(path), contextlib.ExitStack() as stack:
+        if path.exists():
+            old = os.open(path, os.O_RDONLY)
+            stack.callback(os.close, old)
+            keep_writers_out(old)
+        _sync(new)
+        put_in_place(new, path)
+        _sync(path.parent)
+    _remove_map(new)  # its lock file
+
+
+def _sync(path: Path) -> None:
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
 
 
 def _refuse_existing(path: Path) -> None:
@@ -69,8 +135,12 @@ def _partial_file(path: Path) -> Iterator[Path]:
     try:
         yield partial
     finally:
-        _remove(partial)
-        _remove(partial.with_name(partial.name + "-lock"))
+        _remove_map(partial)
+
+
+def _remove_map(path: Path) -> None:
+    _remove(path)
+    _remove(path.with_name(path.name + "-lock"))
 
 
 def _remove(leftover: Path) -> None:

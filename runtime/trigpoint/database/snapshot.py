@@ -21,6 +21,7 @@ from trigpoint.frame import ModelIdentity
 
 MAX_MAP_BYTES = 2**37  # of address space, not of disk; arm64 kernels may offer no more than 2**39
 OVERWRITTEN = "overwritten while open (replace maps by renaming, not in place)"
+_COPY_BYTES = 2**20
 LOCK_BYTES = 16_384  # more than the lock file of LMDB's 126 readers needs
 
 # LMDB wants one environment for a file in a process: readers and a writer share it. The keys are
@@ -173,7 +174,7 @@ class Snapshot:
             # The file holds a later commit: one is in progress, or another map was copied over it.
             self.is_behind = self._newest_commit() > self._txn.id()
             self._is_kept = self._environment.info()["num_readers"] > 0
-            self._tree = Tree(self._fd, meta)
+            self._meta, self._tree = meta, Tree(self._fd, meta)
             self._checked: set[bytes] = set()
             self._tree.check(schema.METADATA_KEY)
             if self._txn.get(schema.METADATA_KEY) is None:
@@ -228,6 +229,21 @@ class Snapshot:
     def count_entries(self) -> int:
         """Count keys, ours and foreign ones."""
         return self._txn.stat()["entries"]
+
+    def copy_to(self, fd: int) -> None:
+        """Write this state to an empty file, each page in its place.
+
+        So two states differ in the pages that changes have touched, which LMDB's own copies do not
+        promise of one state beside a writer.
+        """
+        meta = self._meta
+        os.pwrite(fd, meta.encode_pages(), 0)
+        offset, end = 2 * meta.page_bytes, meta.num_pages * meta.page_bytes
+        while offset < end:
+            data = os.pread(self._fd, min(_COPY_BYTES, end - offset), offset)
+            if not data:
+                raise DamageError("cut short while open (replace maps by renaming, not in place)")
+            offset += os.pwrite(fd, data, offset)
 
     def require_kept(self) -> None:
         """Raise DatabaseError if a writer may have reused pages of this snapshot.

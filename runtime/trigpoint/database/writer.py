@@ -65,7 +65,7 @@ class MapWriter:
                 raise DatabaseError("cannot be made: its folder does not exist") from None
             undo.callback(path.unlink)
             undo.callback(os.close, fd)
-            _lock(fd)
+            keep_writers_out(fd)
             metadata = schema.Metadata(model)
             environment = _writable_environment(path, fd)
             with environment.begin(write=True) as txn:
@@ -80,7 +80,7 @@ class MapWriter:
         with reporting(path), ExitStack() as undo:
             fd = os.open(path, os.O_RDWR)
             undo.callback(os.close, fd)
-            _lock(fd)
+            keep_writers_out(fd)
             require_in_place(path, fd)
             Snapshot(path, model).close()  # before LMDB writes to the lock file
             environment = _writable_environment(path, fd)
@@ -98,6 +98,11 @@ class MapWriter:
 
     def __len__(self) -> int:
         return self._num_images
+
+    @property
+    def generation(self) -> int:
+        """Rises with each commit."""
+        return self._metadata.generation
 
     def add(
         self,
@@ -305,7 +310,8 @@ def _writable_environment(path: Path, fd: int) -> lmdb.Environment:
     return environment
 
 
-def _lock(fd: int) -> None:
+def keep_writers_out(fd: int) -> None:
+    """Be the only writer of an open map file until it is closed; another one is an error."""
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
