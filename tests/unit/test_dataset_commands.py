@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.unit.conftest import Run
 from tests.unit.layouts import POSES, View, write_cambridge
-from tests.unit.test_cli import Run
-from tests.unit.test_cli import run as run  # a fixture
 from trigpoint_db.importers.colmap import write_model
 from trigpoint_db.importers.registry import read_dataset
 from trigpoint_db.poses import read_poses, read_queries, write_poses

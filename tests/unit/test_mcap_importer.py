@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from tests.unit import slam_layouts as layouts
+from tests.unit.conftest import Run
 from tests.unit.layouts import POSES, View, check_truth
 from tests.unit.slam_layouts import BODY_FROM_CAM, START_NS, moved, write_foxglove, write_ros
-from tests.unit.test_cli import Run
-from tests.unit.test_cli import run as run  # a fixture
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError, SourceError, TrigpointError

@@ -6,7 +6,7 @@ import contextlib
 import glob
 import os
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from trigpoint.database.reader import MapReader
@@ -44,6 +44,22 @@ def compact_map(path: Path) -> None:
         raise DatabaseError(f"{path}: is damaged and stays as it is: {problems[0]}")
     with closing(MapWriter.open(path, model)) as writer, _partial_file(path) as partial:
         writer.copy_to(partial)
+        put_in_place(partial, path)
+
+
+@contextmanager
+def rewritten_map(path: Path) -> Iterator[tuple[MapReader, MapWriter]]:
+    """Write a map anew, from what it holds; it takes the place of the old one when it is complete.
+
+    Its readers keep the old one until they refresh; other writers are turned away meanwhile.
+    """
+    path = path.resolve()  # the file itself is replaced, not a link to it
+    with ExitStack() as stack:
+        reader = stack.enter_context(MapReader.open(path))
+        stack.enter_context(closing(MapWriter.open(path, reader.model)))
+        partial = stack.enter_context(_partial_file(path))
+        with MapWriter.create(partial, reader.model) as writer:
+            yield reader, writer
         put_in_place(partial, path)
 
 
