@@ -37,6 +37,7 @@ from trigpoint_db.build import (
 )
 from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.cli_maps import app as maps
+from trigpoint_db.cli_report import app as report_app
 from trigpoint_db.cli_survey import DensityAngle, DensityText, check_images, read_density
 from trigpoint_db.cli_survey import app as survey_app
 from trigpoint_db.demo import make_demo, prepare_folder
@@ -73,6 +74,7 @@ app = typer.Typer(
 app.add_typer(maps)  # on the same level
 app.add_typer(importers_cli.app)
 app.add_typer(survey_app)
+app.add_typer(report_app)
 
 
 @app.callback()
