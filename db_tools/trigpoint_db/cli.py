@@ -28,7 +28,6 @@ from trigpoint.models.features import FeatureModel, find_model
 from trigpoint.models.matching import load_matcher
 from trigpoint.options import LocalizerOptions
 from trigpoint.output import check_output, open_text
-from trigpoint.rigid import Rigid3
 from trigpoint_db.adapt import adapt_model
 from trigpoint_db.build import (
     append_map,
@@ -39,8 +38,11 @@ from trigpoint_db.build import (
 )
 from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.cli_maps import app as maps
+from trigpoint_db.cli_report import app as report_app
+from trigpoint_db.cli_survey import DensityAngle, DensityText, check_images, read_density
+from trigpoint_db.cli_survey import app as survey_app
 from trigpoint_db.demo import make_demo, prepare_folder
-from trigpoint_db.evaluate import evaluate, plot_paths
+from trigpoint_db.evaluate import evaluate, plot_paths, read_truth
 from trigpoint_db.extraction import NetworkFiles, open_crew
 from trigpoint_db.fleet import cli as fleet_cli
 from trigpoint_db.importers import cli as importers_cli
@@ -49,7 +51,7 @@ from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.importers.registry import read_dataset
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import localize_images
-from trigpoint_db.maps import count_sessions
+from trigpoint_db.maps import count_sessions, leave_out
 from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
 from trigpoint_db.recording import FORMATS, RecordedImage, write_recording
 from trigpoint_db.recover import recover
@@ -75,6 +77,8 @@ app = typer.Typer(
 app.add_typer(maps)  # on the same level
 app.add_typer(importers_cli.app)
 app.add_typer(fleet_cli.app)
+app.add_typer(survey_app)
+app.add_typer(report_app)
 
 
 @app.callback()
@@ -122,6 +126,11 @@ def build(
     ] = None,
     session: SessionName = None,
     date: SessionDate = None,
+    select_: Annotated[
+        bool, typer.Option("--select", help="Leave out what `select` would.")
+    ] = False,
+    density: DensityText = None,
+    density_angle: DensityAngle = 15.0,
     keypoints: Annotated[int, typer.Option(help="At most so many an image.", min=50)] = 1024,
     model: Model = "base",
     retrieval: Retrieval = None,
@@ -129,6 +138,9 @@ def build(
 ) -> None:
     """Make a map from images with known poses."""
     survey = make_session(session, date)
+    wanted = read_density(density, density_angle)
+    if wanted is not None and not select_:
+        raise ConfigError("--density is for --select: images are left out by both together")
     dataset = read_dataset(
         source,
         format_,
@@ -168,16 +180,23 @@ def build(
             session=survey,
             crew=crew,
         )
+    selection = check_images(map_, dataset.images, network, num_new=count, density=wanted)
+    if select_ and selection.findings:
+        leave_out(map_, selection.names)
+        count -= len(selection.findings)
     noise = calibrate_map(map_, network, track_calibration)
     size = map_.stat().st_size
     if as_json:
         facts = {"map": str(map_), "num_images_added": count, "bytes": size}
         facts["num_unposed"] = dataset.num_unposed
+        facts |= {"selection": selection.to_json() | {"left_out": select_}}
         print(json.dumps(facts | {"pose_noise": noise and asdict(noise)}))
     else:
         unposed = f", {dataset.num_unposed} without a pose left out" * bool(dataset.num_unposed)
+        advice = " left out" if select_ else "; --select leaves such images out"
         print(
-            f"{map_}: {count} images added{unposed}, {size / 1e6:.1f} MB; {describe_noise(noise)}"
+            f"{map_}: {count} images added{unposed}, {size / 1e6:.1f} MB; "
+            f"{selection}{advice * bool(selection.findings)}; {describe_noise(noise)}"
         )
 
 
@@ -300,13 +319,6 @@ def evaluate_command(
         plot_paths(estimates, {name: reference[name] for name in names}, picture)
         if not as_json:
             console.print(f"picture: {picture}", soft_wrap=True)
-
-
-def read_truth(path: Path) -> dict[str, Rigid3]:
-    """Read reference poses from a COLMAP model's folder or a pose file."""
-    if path.is_dir():
-        return {image.name: image.cam_from_world for image in read_model(path)}
-    return read_poses(path)
 
 
 @app.command()

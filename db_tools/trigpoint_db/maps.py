@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from trigpoint.database.reader import MapReader
-from trigpoint.database.replacing import new_map
+from trigpoint.database.replacing import new_map, rewritten_map
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError
 from trigpoint.frame import Anchor, Session
@@ -96,6 +96,29 @@ def split_map(path: Path, box: Sequence[float], out: Path, *, track: Track = ite
             _copy(reader, writer, track(np.flatnonzero(inside).tolist()))
             writer.set_pose_noise(reader.pose_noise)
             return len(writer)
+
+
+def copy_without(path: Path, names: Iterable[str], out: Path) -> int:
+    """Write the images of a map, but for those named, to a new one; returns how many."""
+    with MapReader.open(path) as reader, new_map(out, reader.model) as writer:
+        return _copy_without(reader, writer, names)
+
+
+def leave_out(path: Path, names: Iterable[str]) -> int:
+    """Rewrite a map without images, in its order; returns how many are left.
+
+    `remove_images` gives the place of one to the last: that is done at once, but neighbours in the
+    map are no more those in the survey.
+    """
+    with rewritten_map(path) as (reader, writer):
+        return _copy_without(reader, writer, names)
+
+
+def _copy_without(reader: MapReader, writer: MapWriter, names: Iterable[str]) -> int:
+    unwanted = set(names)
+    _copy(reader, writer, [i for i, name in enumerate(reader.names()) if name not in unwanted])
+    writer.set_pose_noise(reader.pose_noise)
+    return len(writer)
 
 
 def _copy(reader: MapReader, writer: MapWriter, indices: Iterable[int], prefix: str = "") -> None:

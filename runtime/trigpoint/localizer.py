@@ -138,7 +138,7 @@ class Localizer:
 
     def solve(self, query: Query) -> Solution:
         """Solve for the pose with the anchors that a query is matched with, all at once."""
-        return self._solve(query, True, _Trace(None, Statistics()))
+        return self._solve(query, True, _Trace(self.clock, Statistics()))
 
     def _localize(self, frame: Frame, statistics: Statistics, deadline: _Deadline) -> Result:
         options, trace = self.options, _Trace(self.clock, statistics)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import glob
 import os
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 from trigpoint.database.reader import MapReader
@@ -84,6 +83,22 @@ def compact_map(path: Path) -> None:
         put_in_place(partial, path)
 
 
+@contextmanager
+def rewritten_map(path: Path) -> Iterator[tuple[MapReader, MapWriter]]:
+    """Write a map anew, from what it holds; it takes the place of the old one when it is complete.
+
+    Its readers keep the old one until they refresh; other writers are turned away meanwhile.
+    """
+    path = path.resolve()  # the file itself is replaced, not a link to it
+    with ExitStack() as stack:
+        reader = stack.enter_context(MapReader.open(path))
+        stack.enter_context(closing(MapWriter.open(path, reader.model)))
+        partial = stack.enter_context(_partial_file(path))
+        with MapWriter.create(partial, reader.model) as writer:
+            yield reader, writer
+        put_in_place(partial, path)
+
+
 def install_map(new: Path, path: Path) -> None:
     """Put a whole map in the place of another one, or of none; on disk when this returns.
 
@@ -94,7 +109,7 @@ def install_map(new: Path, path: Path) -> None:
     with MapReader.open(new) as reader:
         if problems := reader.verify():
             raise DatabaseError(f"{new}: is damaged and is not taken: {problems[0]}")
-    with reporting(path), contextlib.ExitStack() as stack:
+    with reporting(path), ExitStack() as stack:
         if path.exists():
             old = os.open(path, os.O_RDONLY)
             stack.callback(os.close, old)
@@ -144,5 +159,5 @@ def _remove_map(path: Path) -> None:
 
 
 def _remove(leftover: Path) -> None:
-    with contextlib.suppress(OSError):
+    with suppress(OSError):
         leftover.unlink()
