@@ -97,7 +97,7 @@ def test_the_parts_of_the_overhead_add_up(demo: Demo, tmp_path: Path, pixel_form
 def test_a_short_run_with_all_that_befalls_it(demo: Demo, tmp_path: Path) -> None:
     records = soak.run(soak.make_setup(demo.folder, tmp_path / "run", fps=30), seconds=9)
     assert records.outcomes["LOCALIZED"] > 0
-    assert set(records.outcomes) == {"LOCALIZED"}
+    assert set(records.outcomes) == {"LOCALIZED", "NO_FRAMES"}  # the camera is unplugged at times
     assert records.events == {
         "request answered": 10,
         "camera unplugged": 2,

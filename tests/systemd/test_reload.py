@@ -112,6 +112,7 @@ def test_requests_are_answered_by_what_was_taken_up(demo: Demo) -> None:
     with contextlib.closing(Reloads(old, lambda: new)) as reloads:
         responder = Responder(old, RequestsConfig(), reloads.pipeline)
         reloads.followers.append(responder.use)
+        reloads.request()
         assert reloads.reload() is reloads.pipeline
         settings = json.loads(responder.answer(Request("config", {})).payload)
         assert settings["map_frame"] == "hall"
