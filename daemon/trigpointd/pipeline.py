@@ -102,7 +102,6 @@ class Pipeline:
             _log.error("%s; going on with the map as it was, as far as it can be read", problem)
         elif is_new or (self.map_problem and not problem):
             _log.info("the map is now of generation %d", self.reader.generation)
-            self._reported.clear()
             self._look_for_sessions()
         self.map_problem = problem
 
