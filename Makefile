@@ -16,8 +16,8 @@ SECONDS ?= 600
 LIB = $(DESTDIR)$(PREFIX)/lib
 SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
-.PHONY: demo test test-oak test-systemd test-v4l2 check golden
-.PHONY: bench bench-models bench-localizer bench-daemon soak wheel-test clean
+.PHONY: demo test kill-test test-oak test-systemd test-v4l2 check golden
+.PHONY: bench bench-building bench-models bench-localizer bench-daemon soak wheel-test clean
 .PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
@@ -48,6 +48,10 @@ check: $(READY)
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python -m pytest
 
+# A map changed by processes that are killed at random moments; half a minute.
+kill-test: $(READY)
+	$(BIN)/python -m tests.unit.run_kills 200
+
 # The camera source on a real kernel's virtual camera, in qemu; about a minute.
 test-v4l2: $(READY)
 	sh tests/v4l2/boot.sh $(abspath $(BIN))/python
@@ -64,7 +68,7 @@ golden: $(READY)
 bench: $(READY)
 	@mkdir -p build/bench && rm -f build/bench/map.tpmap
 	@if test -d $(KITCHEN); then \
-	  $(BIN)/trigpoint-db build build/bench/map.tpmap --colmap $(KITCHEN) --images $(KITCHEN)/images \
+	  $(BIN)/trigpoint-db build build/bench/map.tpmap $(KITCHEN) \
 	    --list $(KITCHEN)/map.txt >/dev/null && \
 	  $(BIN)/python benchmarks/stage_times.py build/bench/map.tpmap \
 	    --images $(KITCHEN)/images --queries $(KITCHEN)/queries.txt; \
@@ -73,6 +77,12 @@ bench: $(READY)
 	  $(BIN)/python benchmarks/stage_times.py $(DEMO)/map.tpmap \
 	    --images $(DEMO)/flight --queries $(DEMO)/queries.txt; \
 	fi
+
+# Images a second that maps are built with, on the same data.
+bench-building: $(READY)
+	test -d $(KITCHEN) || test -d $(DEMO)/survey || $(BIN)/trigpoint-db demo $(DEMO)
+	$(BIN)/python -m benchmarks.building \
+	  $(if $(wildcard $(KITCHEN)),$(KITCHEN),$(DEMO))
 
 # Our networks beside RootSIFT and, where its checkout is named, EdgePoint2, which needs torch:
 # make bench-models EDGEPOINT2=../EdgePoint2 FP32=build/fp32

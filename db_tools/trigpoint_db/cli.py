@@ -7,17 +7,16 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 import threadpoolctl
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from trigpoint.camera import Camera
@@ -29,33 +28,57 @@ from trigpoint.models.features import FeatureModel, find_model
 from trigpoint.models.matching import load_matcher
 from trigpoint.options import LocalizerOptions
 from trigpoint.output import check_output, open_text
-from trigpoint.rigid import Rigid3
 from trigpoint_db.adapt import adapt_model
-from trigpoint_db.build import append_map, build_map, check_files, select_images
+from trigpoint_db.build import (
+    append_map,
+    build_map,
+    check_files,
+    select_images,
+    select_new,
+)
 from trigpoint_db.calibrate import calibrate_map
+from trigpoint_db.cli_maps import app as maps
+from trigpoint_db.cli_report import app as report_app
+from trigpoint_db.cli_survey import DensityAngle, DensityText, check_images, read_density
+from trigpoint_db.cli_survey import app as survey_app
 from trigpoint_db.demo import make_demo, prepare_folder
-from trigpoint_db.evaluate import evaluate, plot_paths
+from trigpoint_db.evaluate import evaluate, plot_paths, read_truth
+from trigpoint_db.extraction import NetworkFiles, open_crew
+from trigpoint_db.fleet import cli as fleet_cli
+from trigpoint_db.importers import cli as importers_cli
+from trigpoint_db.importers.cli import Format, Images, Poses, Source
 from trigpoint_db.importers.colmap import read_model
+from trigpoint_db.importers.registry import read_dataset
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import localize_images
+from trigpoint_db.maps import count_sessions, leave_out
 from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
 from trigpoint_db.recording import FORMATS, RecordedImage, write_recording
 from trigpoint_db.recover import recover
+from trigpoint_db.terminal import (
+    Json,
+    MapPath,
+    Model,
+    Retrieval,
+    SessionDate,
+    SessionName,
+    console,
+    make_session,
+    track,
+    track_calibration,
+)
 
-T = TypeVar("T")
 app = typer.Typer(
     help="Off-line tools on maps, recordings and results.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-console = Console()
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
-Model = Annotated[str, typer.Option(help="The network: tiny, base, large, or a file (.onnx).")]
-Retrieval = Annotated[
-    Path | None, typer.Option(help="A retrieval network, where the other needs one beside it.")
-]
-MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="A .tpmap file.")]
+app.add_typer(maps)  # on the same level
+app.add_typer(importers_cli.app)
+app.add_typer(fleet_cli.app)
+app.add_typer(survey_app)
+app.add_typer(report_app)
 
 
 @app.callback()
@@ -64,45 +87,128 @@ def _set_up() -> None:
     threadpoolctl.threadpool_limits(1, user_api="blas")
 
 
-def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
-    """Show a progress bar on standard error, which keeps standard output clean."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
-        yield from progress.track(items, total=total, description=what)
-
-
 @app.command()
 def build(
     map_: MapPath,
-    colmap: Annotated[Path, typer.Option(help="Folder of a COLMAP model, text or binary.")],
-    images: Annotated[Path, typer.Option(help="Folder of the images.")],
+    source: Source,
+    format_: Format = None,
+    images: Images = None,
+    poses: Poses = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Of tum: its name, or 'MODEL width height params...'.")
+    ] = None,
+    image_topic: Annotated[
+        str | None, typer.Option(help="Of mcap: one of several cameras.")
+    ] = None,
+    pose_topic: Annotated[str | None, typer.Option(help="Of mcap: one of several sources.")] = None,
+    mount: Annotated[
+        str | None,
+        typer.Option(
+            metavar="'X Y Z QW QX QY QZ'|FRAME",
+            help="Of mcap: where the camera sits on what the poses are of, or the frame of that.",
+        ),
+    ] = None,
+    max_gap: Annotated[
+        float | None,
+        typer.Option(help="Of tum, euroc, mcap: seconds between two poses, at most.", min=0),
+    ] = None,
     list_: Annotated[Path | None, typer.Option("--list", help="Only these names.")] = None,
     append: Annotated[bool, typer.Option("--append", help="Add to a map.")] = False,
+    skip_existing: Annotated[
+        bool, typer.Option("--skip-existing", help="Leave out images that the map has.")
+    ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a build that was interrupted.")
+    ] = False,
+    jobs: Annotated[int, typer.Option(help="Processes that extract features.", min=1)] = 1,
+    cluster: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, to use its workers.")
+    ] = None,
+    session: SessionName = None,
+    date: SessionDate = None,
+    select_: Annotated[
+        bool, typer.Option("--select", help="Leave out what `select` would.")
+    ] = False,
+    density: DensityText = None,
+    density_angle: DensityAngle = 15.0,
     keypoints: Annotated[int, typer.Option(help="At most so many an image.", min=50)] = 1024,
     model: Model = "base",
     retrieval: Retrieval = None,
     as_json: Json = False,
 ) -> None:
     """Make a map from images with known poses."""
-    posed = read_model(colmap)
+    survey = make_session(session, date)
+    wanted = read_density(density, density_angle)
+    if wanted is not None and not select_:
+        raise ConfigError("--density is for --select: images are left out by both together")
+    dataset = read_dataset(
+        source,
+        format_,
+        images=images,
+        poses=poses,
+        camera=camera,
+        image_topic=image_topic,
+        pose_topic=pose_topic,
+        mount=mount,
+        max_gap=max_gap,
+    )
+    posed = dataset.mapped
     if list_ is not None:
         posed = select_images(posed, read_names(list_))
     if not posed:
-        raise ConfigError(f"there are no images to map: {list_ or colmap} names none")
+        raise ConfigError(f"there are no images to map: {list_ or source} names none")
     check_output(map_)
-    check_files((image.name for image in posed), images)
-    write = append_map if append else build_map
+    if append:
+        posed = select_new(posed, map_, skip_existing=skip_existing)
+    check_files((image.name for image in posed), dataset.images)
+    if append and resume:
+        raise ConfigError("an interrupted --append goes on with --append --skip-existing")
+    write = append_map if append else partial(build_map, resume=resume)
     network = FeatureModel.load(model, retrieval=retrieval)
-    count = write(
-        map_, track(posed, "mapping", len(posed)), images, network, max_keypoints=keypoints
-    )
+    files = NetworkFiles(model, retrieval, network.identity)
+    with (
+        hint_at_resuming(append=append),
+        open_crew(jobs, cluster, files) as crew,
+        closing(track(posed, "mapping", len(posed))) as tracked,
+    ):
+        count = write(
+            map_,
+            tracked,
+            dataset.images,
+            network,
+            max_keypoints=keypoints,
+            session=survey,
+            crew=crew,
+        )
+    selection = check_images(map_, dataset.images, network, num_new=count, density=wanted)
+    if select_ and selection.findings:
+        leave_out(map_, selection.names)
+        count -= len(selection.findings)
     noise = calibrate_map(map_, network, track_calibration)
     size = map_.stat().st_size
     if as_json:
         facts = {"map": str(map_), "num_images_added": count, "bytes": size}
+        facts["num_unposed"] = dataset.num_unposed
+        facts |= {"selection": selection.to_json() | {"left_out": select_}}
         print(json.dumps(facts | {"pose_noise": noise and asdict(noise)}))
     else:
-        print(f"{map_}: {count} images added, {size / 1e6:.1f} MB; {describe_noise(noise)}")
+        unposed = f", {dataset.num_unposed} without a pose left out" * bool(dataset.num_unposed)
+        advice = " left out" if select_ else "; --select leaves such images out"
+        print(
+            f"{map_}: {count} images added{unposed}, {size / 1e6:.1f} MB; "
+            f"{selection}{advice * bool(selection.findings)}; {describe_noise(noise)}"
+        )
+
+
+@contextmanager
+def hint_at_resuming(*, append: bool) -> Iterator[None]:
+    """Say after an interruption how the command goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        how = "--skip-existing" if append else "--resume"
+        print(f"trigpoint-db: interrupted; the same command goes on with {how}", file=sys.stderr)
+        raise
 
 
 @app.command()
@@ -127,11 +233,6 @@ def describe_noise(noise: PoseNoise | None) -> str:
         f"distance, {np.rad2deg(noise.rotation_rad):.2g} degrees and "
         f"{np.rad2deg(noise.rotation_drift_rad):.2g} for each unit of it"
     )
-
-
-def track_calibration(images: list[int]) -> Iterator[int]:
-    """Show a progress bar of a calibration."""
-    return track(images, "calibrating", len(images))
 
 
 @app.command()
@@ -220,13 +321,6 @@ def evaluate_command(
             console.print(f"picture: {picture}", soft_wrap=True)
 
 
-def read_truth(path: Path) -> dict[str, Rigid3]:
-    """Read reference poses from a COLMAP model's folder or a pose file."""
-    if path.is_dir():
-        return {image.name: image.cam_from_world for image in read_model(path)}
-    return read_poses(path)
-
-
 @app.command()
 def info(map_: MapPath, as_json: Json = False) -> None:
     """Say what a map holds."""
@@ -241,6 +335,7 @@ def info(map_: MapPath, as_json: Json = False) -> None:
             "descriptor_dim": reader.model.descriptor_dim,
             "global_dim": reader.model.global_dim,
             "pose_noise": reader.pose_noise and asdict(reader.pose_noise),
+            "sessions": count_sessions(reader),
             "bytes": map_.stat().st_size,
             "min_center": centers.min(axis=0).tolist() if len(centers) else None,
             "max_center": centers.max(axis=0).tolist() if len(centers) else None,
@@ -249,6 +344,9 @@ def info(map_: MapPath, as_json: Json = False) -> None:
         print(json.dumps(facts))
         return
     table = Table(show_header=False)
+    for session in facts.pop("sessions"):
+        about = f"session {session['name'] or 'none'}", session["date"] or ""
+        table.add_row(" ".join(about), f"{session['num_images']} images")
     for key, value in facts.items():
         table.add_row(key, str(value))
     console.print(table)

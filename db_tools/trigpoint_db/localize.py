@@ -27,7 +27,7 @@ def localize_images(
     """Localize queries one by one; an image that cannot be read does not stop the others."""
     for query in queries:
         try:
-            frame = read_frame(folder / query.name, query.camera, query.name)
+            frame = read_frame(folder, query.name, query.camera)
             result: Result | Failed = localizer.localize(frame)
         except (ConfigError, SourceError) as error:
             result = Failed("BAD_FRAME", str(error))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import date
 from enum import StrEnum
 from typing import Any
 
@@ -107,6 +108,23 @@ class PoseNoise:
         return np.repeat(np.column_stack([position, rotation]), 3, axis=1)
 
 
+@dataclass(frozen=True)
+class Session:
+    """A survey: images of a map that were taken on one occasion."""
+
+    name: str
+    date: date | None = None
+
+    def __post_init__(self) -> None:
+        if not (1 <= len(self.name) <= 100 and self.name.isprintable()):
+            raise ConfigError(
+                f"a session's name has 1 to 100 printable characters; it is {self.name[:100]!r}"
+            )
+
+    def __str__(self) -> str:
+        return self.name if self.date is None else f"{self.name} ({self.date})"
+
+
 @dataclass(frozen=True, eq=False)
 class Anchor:
     """A reference image of the map, with its known pose."""
@@ -175,6 +193,7 @@ class Statistics:
     turned_deg: int = 0  # counterclockwise, of the image that the features are of
     generator: str = ""  # which hypothesis was refined: "anchor_pairs" or "latent_points"
     anchors: tuple[str, ...] = ()  # names, best first
+    anchor_inliers: tuple[int, ...] = ()  # of the last pose: how many each anchor sees
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 

@@ -25,7 +25,8 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import build_map
 from trigpoint_db.demo import CAMERA
-from trigpoint_db.importers.colmap import PosedImage, read_model
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import read_model
 from trigpointd.config import Config, McapConfig, RequestsConfig
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.request_queue import RequestQueue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
@@ -13,10 +13,17 @@ from numpy.typing import NDArray
 from trigpoint.camera import Camera
 from trigpoint.database import schema
 from trigpoint.database.pages import DamageError
-from trigpoint.database.ranking import POOL, choose_diverse, find_largest
+from trigpoint.database.ranking import POOL, PREFERENCE, choose_diverse, find_largest
 from trigpoint.database.snapshot import OVERWRITTEN, LockFileError, Snapshot, reporting
 from trigpoint.errors import DatabaseError
-from trigpoint.frame import Anchor, LocalFeatures, ModelIdentity, PoseNoise, restore_descriptors
+from trigpoint.frame import (
+    Anchor,
+    LocalFeatures,
+    ModelIdentity,
+    PoseNoise,
+    Session,
+    restore_descriptors,
+)
 from trigpoint.rigid import Rigid3
 
 Array32 = NDArray[np.float32]
@@ -72,6 +79,11 @@ class MapReader:
         """How well the poses of the map agree; None where that was not measured."""
         return self._metadata.pose_noise
 
+    @property
+    def sessions(self) -> tuple[Session, ...]:
+        """The surveys that images of the map are of, or were."""
+        return self._metadata.sessions
+
     def __len__(self) -> int:
         return self._metadata.num_images
 
@@ -80,6 +92,12 @@ class MapReader:
         with self._reading() as snapshot:
             images = (snapshot.get(schema.image_key(index)) for index in range(len(self)))
             return [schema.decode_name(image) for image in images]
+
+    def sessions_by_index(self) -> list[Session | None]:
+        """Return the session of each image, by index."""
+        table = (None, *self.sessions)
+        with self._reading() as snapshot:
+            return [table[i] for b in _blocks(snapshot) for i in b.sessions.tolist()]
 
     def view(self, index: int) -> tuple[Camera, Rigid3]:
         """Return the camera of an image and its pose, cam_from_world."""
@@ -96,6 +114,21 @@ class MapReader:
             )
         return Anchor(image.name, image.camera, image.cam_from_world, keypoints, descriptors)
 
+    def record(self, index: int) -> schema.Record:
+        """Return an image as it lies in the map, for another map."""
+        with self._reading() as snapshot:
+            _require_index(snapshot, index)
+            block, place = divmod(index, schema.BLOCK_ROWS)
+            row = _block(snapshot, block).row(place)
+            image = bytes(snapshot.get(schema.image_key(index)))
+            return schema.Record(
+                schema.decode_name(memoryview(image)),
+                image,
+                bytes(snapshot.get(schema.features_key(index))),
+                row,
+                (None, *self.sessions)[row.session],
+            )
+
     def features(self, index: int) -> LocalFeatures:
         """Return an image's features as if it were a query; its scores are not in the map."""
         anchor = self.anchor(index)
@@ -106,7 +139,13 @@ class MapReader:
         return LocalFeatures(anchor.keypoints, descriptors, scores, described)
 
     def search(
-        self, global_descriptor: Array32, k: int, diversity: float = 0.0
+        self,
+        global_descriptor: Array32,
+        k: int,
+        diversity: float = 0.0,
+        *,
+        prefer: Collection[str] = (),
+        exclude: Collection[str] = (),
     ) -> tuple[NDArray[np.intp], Array32]:
         """Find the images that look most alike, by comparing with all.
 
@@ -121,11 +160,16 @@ class MapReader:
             How many, at the most.
         diversity : float
             See `choose_diverse`; the choice is among the `POOL` k most similar images.
+        prefer, exclude : collection of str
+            Names of sessions: images of the former come as if their cosine were larger by
+            `PREFERENCE`, those of the latter not at all. Names that the map does not have are of
+            no effect.
 
         Returns
         -------
         indices : (k,) int
-            Best first: without diversity the most similar, equally similar ones by index.
+            Best first: without diversity and preferences the most similar, equally similar ones by
+            index.
         similarities : (k,) float32
             Cosines.
         """
@@ -135,17 +179,30 @@ class MapReader:
                 f"{self._path}: searched for numbers {global_descriptor.shape}; "
                 f"its global descriptors are ({dim},), all finite"
             )
+        bonus = _bonus(self.sessions, prefer, exclude)
         similarities = np.empty(len(self), np.float32)
+        scores = similarities if bonus is None else np.empty_like(similarities)
         with self._reading() as snapshot:
-            for block, start in enumerate(range(0, len(similarities), schema.BLOCK_ROWS)):
-                part = similarities[start : start + schema.BLOCK_ROWS]
-                scales, rows = _rows(snapshot, block)
-                np.multiply(rows.astype(np.float32) @ global_descriptor, scales, out=part)
-            best = find_largest(similarities, k if diversity == 0 else POOL * k)
+            for i, block in enumerate(_blocks(snapshot)):
+                part = slice(schema.BLOCK_ROWS * i, schema.BLOCK_ROWS * (i + 1))
+                rows = block.numbers.astype(np.float32)
+                np.multiply(rows @ global_descriptor, block.scales, out=similarities[part])
+                if bonus is not None:
+                    np.add(similarities[part], bonus[block.sessions], out=scores[part])
+            best = find_largest(scores, k if diversity == 0 else POOL * k)
+            best = best[scores[best] > -np.inf]
             if diversity > 0:
                 alike = _descriptors(snapshot, best)
-                best = best[choose_diverse(similarities[best], alike @ alike.T, k, diversity)]
+                best = best[choose_diverse(scores[best], alike @ alike.T, k, diversity)]
         return best, similarities[best]
+
+    def copy_to(self, fd: int) -> None:
+        """Write the snapshot to an empty file, as a map of its own.
+
+        What two snapshots of a file have in common lies in the same places of their copies.
+        """
+        with self._reading() as snapshot:
+            snapshot.copy_to(fd)
 
     def refresh(self) -> bool:
         """Move to the newest snapshot, also of another file renamed into place; True if it differs.
@@ -202,7 +259,7 @@ class MapReader:
                         problems.append(f"the name {name!r} does not lead to image {index}")
             for block in range(num_blocks):
                 with _collecting(problems):
-                    _rows(snapshot, block)
+                    _block(snapshot, block)
             found, wanted = snapshot.count_entries(), 1 + 3 * len(self) + num_blocks
             if found != wanted:
                 problems.append(f"there are {found} entries where {wanted} belong")
@@ -233,20 +290,43 @@ def _collecting(problems: list[str]) -> Iterator[None]:
         problems.append(str(error))
 
 
-def _image(snapshot: Snapshot, index: int) -> schema.Image:
+def _require_index(snapshot: Snapshot, index: int) -> None:
     if not 0 <= index < snapshot.metadata.num_images:
         raise DatabaseError(f"no image {index} among {snapshot.metadata.num_images}")
+
+
+def _image(snapshot: Snapshot, index: int) -> schema.Image:
+    _require_index(snapshot, index)
     return schema.decode_image(snapshot.get(schema.image_key(index)))
 
 
-def _rows(snapshot: Snapshot, block: int) -> tuple[Array32, NDArray[np.int8]]:
+def _blocks(snapshot: Snapshot) -> Iterator[schema.Block]:
+    return (
+        _block(snapshot, i) for i in range(-(-snapshot.metadata.num_images // schema.BLOCK_ROWS))
+    )
+
+
+def _block(snapshot: Snapshot, number: int) -> schema.Block:
     metadata = snapshot.metadata
-    payload = snapshot.get(schema.block_key(block))
-    scales, rows = schema.decode_block(payload, metadata.model.global_dim)
-    wanted = min(metadata.num_images - block * schema.BLOCK_ROWS, schema.BLOCK_ROWS)
-    if len(rows) != wanted:
-        raise DamageError(f"retrieval block {block} has {len(rows)} rows, not {wanted}")
-    return scales, rows
+    payload = snapshot.get(schema.block_key(number))
+    block = schema.decode_block(payload, metadata.model.global_dim)
+    wanted = min(metadata.num_images - number * schema.BLOCK_ROWS, schema.BLOCK_ROWS)
+    if len(block.numbers) != wanted:
+        raise DamageError(f"retrieval block {number} has {len(block.numbers)} rows, not {wanted}")
+    if block.sessions.max() > len(metadata.sessions):
+        raise DamageError(f"retrieval block {number} has images of an unknown session")
+    return block
+
+
+def _bonus(
+    sessions: tuple[Session, ...], prefer: Collection[str], exclude: Collection[str]
+) -> Array32 | None:
+    """Return what each session, from none on, adds to a similarity; None if that is nothing."""
+    bonus = [0.0] + [
+        -np.inf if session.name in exclude else PREFERENCE * (session.name in prefer)
+        for session in sessions
+    ]
+    return np.array(bonus, np.float32) if any(bonus) else None
 
 
 def _descriptors(snapshot: Snapshot, indices: NDArray[np.intp]) -> Array32:
@@ -254,8 +334,8 @@ def _descriptors(snapshot: Snapshot, indices: NDArray[np.intp]) -> Array32:
     descriptors = np.empty((len(indices), snapshot.metadata.model.global_dim), np.float32)
     block_of = indices // schema.BLOCK_ROWS
     for block in np.unique(block_of):
-        scales, rows = _rows(snapshot, int(block))
+        rows = _block(snapshot, int(block))
         here = block_of == block
         inside = indices[here] % schema.BLOCK_ROWS
-        descriptors[here] = rows[inside] * scales[inside, None]
+        descriptors[here] = rows.numbers[inside] * rows.scales[inside, None]
     return descriptors

@@ -7,13 +7,15 @@ neither an altered byte nor a value under a wrong key goes unnoticed.
     key                        value after the CRC
     00                         metadata, JSON
     01 name                    index of the image, u32
-    02 block u32               up to 256 retrieval rows: scales (n,) f4, rows (n, G) i1
+    02 block u32               up to 256 retrieval rows: scales (n,) f4, sessions (n,) u2,
+                               numbers (n, G) i1
     03 index u32 00            an image: pose, camera, sizes, its first keypoints, name
     03 index u32 01            its features: other keypoints (N - j, 2) u2, descriptors (N, D) i1
 
 Keypoints are fixed point, `x = u step - 0.5` with `step = max(width, height) / 65535` px.
 Descriptors are `i 4 / (127 sqrt(D))`: numbers of a unit vector have a standard deviation of
-1 / sqrt(D). Retrieval rows have a scale each, which makes the stored row a unit vector.
+1 / sqrt(D). Retrieval rows have a scale each, which makes the stored row a unit vector. Their
+sessions are places in the metadata's list, from 1 on; 0 is no session.
 """
 
 from __future__ import annotations
@@ -22,7 +24,10 @@ import dataclasses
 import json
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import date
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,16 +35,24 @@ from numpy.typing import NDArray
 from trigpoint.camera import PARAMETERS, Camera
 from trigpoint.database.pages import HEADER_BYTES, DamageError
 from trigpoint.errors import ConfigError, DatabaseError
-from trigpoint.frame import LocalFeatures, ModelIdentity, PoseNoise, quantize_descriptors
+from trigpoint.frame import (
+    LocalFeatures,
+    ModelIdentity,
+    PoseNoise,
+    Session,
+    quantize_descriptors,
+)
 from trigpoint.rigid import Rigid3
 
 Array32 = NDArray[np.float32]
 
-FORMAT = 2
+FORMAT = 3
 BLOCK_ROWS = 256
 MAX_NAME_BYTES = 500  # LMDB's keys end at 511
 MAX_KEYPOINTS = 65_535
 MAX_CAMERA_PARAMETERS = 8
+MAX_SESSIONS = 65_535
+NO_SESSION = 0
 
 METADATA_KEY = b"\x00"
 _CRC = struct.Struct("<I")
@@ -102,10 +115,12 @@ class Metadata:
     generation: int = 0  # rises with each commit
     num_images: int = 0
     pose_noise: PoseNoise | None = None  # as measured
+    sessions: tuple[Session, ...] = ()
 
     def encode(self) -> bytes:
         """Write JSON."""
-        return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}).encode()
+        fields = {"format": FORMAT, **dataclasses.asdict(self)}
+        return json.dumps(fields, default=date.isoformat).encode()
 
     @classmethod
     def decode(cls, payload: bytes) -> Metadata:
@@ -116,14 +131,29 @@ class Metadata:
                 f"a map of format {found}, and this version reads format {FORMAT}; "
                 "rebuild it with `trigpoint-db build` or use the version that made it"
             )
-        noise = fields.get("pose_noise")
+        noise, sessions = fields["pose_noise"], fields["sessions"]
         return cls(
             **fields
             | {
                 "model": ModelIdentity(**fields["model"]),
                 "pose_noise": None if noise is None else PoseNoise(**noise),
+                "sessions": tuple(
+                    Session(s["name"], s["date"] and date.fromisoformat(s["date"]))
+                    for s in sessions
+                ),
             }
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """An image as it lies in a map, ready for another one; `row.session` is the former's."""
+
+    name: str
+    image: bytes
+    features: bytes
+    row: Row
+    session: Session | None
 
 
 def encode_index(index: int) -> bytes:
@@ -187,6 +217,12 @@ def decode_name(payload: memoryview) -> str:
     return bytes(payload[_IMAGE.size + 4 * num_inline :]).decode()
 
 
+def rename_image(payload: bytes, name: str) -> bytes:
+    """Write an image under another name."""
+    num_inline = _IMAGE.unpack_from(payload)[-1]
+    return payload[: _IMAGE.size + 4 * num_inline] + name.encode()
+
+
 def decode_image(payload: memoryview) -> Image:
     """Read an image."""
     *numbers, model, width, height, num_keypoints, num_inline = _IMAGE.unpack_from(payload)
@@ -232,13 +268,42 @@ def quantize_row(row: Array32) -> tuple[np.float32, NDArray[np.int8]]:
     return np.float32(1 / max(norm, 1.0)), numbers
 
 
-def encode_block(scales: Array32, rows: NDArray[np.int8]) -> bytes:
-    """Write retrieval rows (n, G) and their scales (n,)."""
-    return scales.astype("<f4").tobytes() + rows.tobytes()
+class Row(NamedTuple):
+    """What retrieval knows of an image: its global descriptor is scale * numbers."""
+
+    scale: np.float32
+    session: int
+    numbers: NDArray[np.int8]  # (G,)
 
 
-def decode_block(payload: memoryview, dim: int) -> tuple[Array32, NDArray[np.int8]]:
-    """View retrieval rows (n, G) and their scales (n,) where they lie."""
-    split = len(payload) // (4 + dim) * 4
-    scales = np.frombuffer(payload[:split], "<f4")
-    return scales, np.frombuffer(payload[split:], np.int8).reshape(-1, dim)
+class Block(NamedTuple):
+    """Retrieval rows of several images."""
+
+    scales: Array32  # (n,)
+    sessions: NDArray[np.uint16]  # (n,)
+    numbers: NDArray[np.int8]  # (n, G)
+
+    def row(self, place: int) -> Row:
+        """Copy one of them."""
+        return Row(self.scales[place], int(self.sessions[place]), self.numbers[place].copy())
+
+
+def encode_block(rows: Sequence[Row]) -> bytes:
+    """Write retrieval rows."""
+    scales, sessions, numbers = zip(*rows, strict=True)
+    return (
+        np.array(scales, "<f4").tobytes()
+        + np.array(sessions, "<u2").tobytes()
+        + np.array(numbers, np.int8).tobytes()
+    )
+
+
+def decode_block(payload: memoryview, dim: int) -> Block:
+    """View retrieval rows of G = `dim` numbers where they lie."""
+    num_rows = len(payload) // (4 + 2 + dim)
+    scales, sessions = payload[: 4 * num_rows], payload[4 * num_rows : 6 * num_rows]
+    return Block(
+        np.frombuffer(scales, "<f4"),
+        np.frombuffer(sessions, "<u2"),
+        np.frombuffer(payload[6 * num_rows :], np.int8).reshape(-1, dim),
+    )

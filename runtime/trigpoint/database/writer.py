@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
@@ -13,15 +14,22 @@ from typing import Self
 import lmdb
 import numpy as np
 from lmdb.verify import VerifyError, verify
-from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
 from trigpoint.database import schema
 from trigpoint.database.pages import DamageError
-from trigpoint.database.snapshot import Snapshot, reporting, share_environment
+from trigpoint.database.snapshot import (
+    Snapshot,
+    reporting,
+    require_in_place,
+    share_environment,
+)
 from trigpoint.errors import DatabaseError
-from trigpoint.frame import LocalFeatures, ModelIdentity, PoseNoise
+from trigpoint.frame import LocalFeatures, ModelIdentity, PoseNoise, Session
 from trigpoint.rigid import Rigid3
+
+MIN_PAGE_BYTES = 4096
+PAGES_A_CHANGE = 32  # that one entry, beside its value, may renew in LMDB's trees
 
 
 class MapWriter:
@@ -39,8 +47,9 @@ class MapWriter:
         self._num_images = metadata.num_images
         self._pose_noise = metadata.pose_noise
         self._has_removed = False  # since the last commit
-        self._scales: list[np.float32] = []  # of the last retrieval block, unless it is full
-        self._rows: list[NDArray[np.int8]] = []
+        self._num_new_pages = 0  # since then, at the most
+        self._sessions = list(metadata.sessions)
+        self._rows: list[schema.Row] = []  # of the last retrieval block, unless it is full
         self._environment: lmdb.Environment | None = _writable_environment(path, fd)
         self._txn: lmdb.Transaction | None = None
 
@@ -56,7 +65,7 @@ class MapWriter:
                 raise DatabaseError("cannot be made: its folder does not exist") from None
             undo.callback(path.unlink)
             undo.callback(os.close, fd)
-            _lock(fd)
+            keep_writers_out(fd)
             metadata = schema.Metadata(model)
             environment = _writable_environment(path, fd)
             with environment.begin(write=True) as txn:
@@ -71,42 +80,78 @@ class MapWriter:
         with reporting(path), ExitStack() as undo:
             fd = os.open(path, os.O_RDWR)
             undo.callback(os.close, fd)
-            _lock(fd)
+            keep_writers_out(fd)
+            require_in_place(path, fd)
+            Snapshot(path, model).close()  # before LMDB writes to the lock file
+            environment = _writable_environment(path, fd)
+            # A writer killed at the end of its commit leaves all but the next writer at the commit
+            # before: without this, the metadata would be those of another tree.
+            environment.begin(write=True).abort()
             with closing(Snapshot(path, model)) as snapshot:
                 _require_sound(path)
                 writer = cls(path, fd, snapshot.metadata)
                 block, num_rows = divmod(len(writer), schema.BLOCK_ROWS)
                 if num_rows:
-                    writer._load_block(snapshot.get(schema.block_key(block)))
+                    writer._rows = writer._decode_rows(snapshot.get(schema.block_key(block)))
             undo.pop_all()
             return writer
 
     def __len__(self) -> int:
         return self._num_images
 
+    @property
+    def generation(self) -> int:
+        """Rises with each commit."""
+        return self._metadata.generation
+
     def add(
-        self, name: str, camera: Camera, cam_from_world: Rigid3, features: LocalFeatures
+        self,
+        name: str,
+        camera: Camera,
+        cam_from_world: Rigid3,
+        features: LocalFeatures,
+        session: Session | None = None,
     ) -> int:
         """Add an image and return its index; one that cannot be added leaves no trace."""
         with self._writing() as txn:
             _require_name(name)
             _require_pose(name, cam_from_world)
             _require_features(name, features, camera, self._metadata.model)
-            if txn.get(schema.name_key(name)) is not None:
-                raise DatabaseError(f"holds an image {name!r} already")
-            index = self._num_images
             image, arrays = schema.encode_image(name, camera, cam_from_world, features)
-            _put(txn, schema.name_key(name), schema.encode_index(index))
-            _put(txn, schema.image_key(index), image)
-            _put(txn, schema.features_key(index), arrays)
-            scale, row = schema.quantize_row(features.global_descriptor)
-            self._scales.append(scale)
-            self._rows.append(row)
-            self._num_images += 1
-            if len(self._rows) == schema.BLOCK_ROWS:
-                self._put_last_block(txn)
-                self._scales, self._rows = [], []
+            scale, numbers = schema.quantize_row(features.global_descriptor)
+            row = schema.Row(scale, schema.NO_SESSION, numbers)
+            return self._append(txn, schema.Record(name, image, arrays, row, session))
+
+    def add_record(self, record: schema.Record, name: str) -> int:
+        """Add an image of another map of the same model under a name; return its index."""
+        with self._writing() as txn:
+            _require_name(name)
+            image = schema.rename_image(record.image, name)
+            return self._append(txn, replace(record, name=name, image=image))
+
+    def _append(self, txn: lmdb.Transaction, record: schema.Record) -> int:
+        if txn.get(schema.name_key(record.name)) is not None:
+            raise DatabaseError(f"holds an image {record.name!r} already")
+        index = self._num_images
+        row = record.row._replace(session=self._number_of(record.session))
+        self._put(txn, schema.name_key(record.name), schema.encode_index(index))
+        self._put(txn, schema.image_key(index), record.image)
+        self._put(txn, schema.features_key(index), record.features)
+        self._rows.append(row)
+        self._num_images += 1
+        if len(self._rows) == schema.BLOCK_ROWS:
+            self._put_last_block(txn)
+            self._rows = []
         return index
+
+    def _number_of(self, session: Session | None) -> int:
+        if session is None:
+            return schema.NO_SESSION
+        if session not in self._sessions:
+            if len(self._sessions) == schema.MAX_SESSIONS:
+                raise DatabaseError(f"holds {schema.MAX_SESSIONS} sessions, the most it can")
+            self._sessions.append(session)
+        return self._sessions.index(session) + 1
 
     def remove(self, name: str) -> None:
         """Remove an image; the last one takes its index, so that there is no gap."""
@@ -117,38 +162,31 @@ class MapWriter:
             index = schema.decode_index(_get(txn, schema.name_key(name)))
             last = self._num_images - 1
             if not self._rows:
-                self._load_block(_get(txn, schema.block_key(last // schema.BLOCK_ROWS)))
-            scale, row = self._scales.pop(), self._rows.pop()
+                block = _get(txn, schema.block_key(last // schema.BLOCK_ROWS))
+                self._rows = self._decode_rows(block)
+            row = self._rows.pop()
             if index != last:
-                self._move(txn, last, index, scale, row)
+                self._move(txn, last, index, row)
             for key in (schema.name_key(name), schema.image_key(last), schema.features_key(last)):
-                txn.delete(key)
+                self._delete(txn, key)
             if not self._rows:
-                txn.delete(schema.block_key(last // schema.BLOCK_ROWS))
+                self._delete(txn, schema.block_key(last // schema.BLOCK_ROWS))
             self._num_images, self._has_removed = last, True
 
-    def _move(
-        self,
-        txn: lmdb.Transaction,
-        source: int,
-        target: int,
-        scale: np.float32,
-        row: NDArray[np.int8],
-    ) -> None:
+    def _move(self, txn: lmdb.Transaction, source: int, target: int, row: schema.Row) -> None:
         """Give the image at the end, whose row has been taken off, another one's index."""
         for key_of in (schema.image_key, schema.features_key):
-            _put(txn, key_of(target), bytes(_get(txn, key_of(source))))
+            self._put(txn, key_of(target), bytes(_get(txn, key_of(source))))
         name = schema.decode_name(_get(txn, schema.image_key(source)))
-        _put(txn, schema.name_key(name), schema.encode_index(target))
+        self._put(txn, schema.name_key(name), schema.encode_index(target))
         block, place = divmod(target, schema.BLOCK_ROWS)
         if block == source // schema.BLOCK_ROWS:
-            self._scales[place], self._rows[place] = scale, row
+            self._rows[place] = row
             return
         key = schema.block_key(block)
-        scales, rows = schema.decode_block(_get(txn, key), self._metadata.model.global_dim)
-        scales, rows = scales.copy(), rows.copy()
-        scales[place], rows[place] = scale, row
-        _put(txn, key, schema.encode_block(scales, rows))
+        rows = self._decode_rows(_get(txn, key))
+        rows[place] = row
+        self._put(txn, key, schema.encode_block(rows))
 
     def set_pose_noise(self, noise: PoseNoise | None) -> None:
         """Say how well the poses of the map agree, None if that is not known."""
@@ -156,16 +194,39 @@ class MapWriter:
 
     def commit(self) -> None:
         """Put what was added on disk; returns when it is there."""
-        metadata = replace(self._metadata, num_images=self._num_images, pose_noise=self._pose_noise)
+        metadata = replace(
+            self._metadata,
+            num_images=self._num_images,
+            pose_noise=self._pose_noise,
+            sessions=tuple(self._sessions),
+        )
         if metadata == self._metadata and not self._has_removed:
             return
         with self._writing() as txn:
             if self._rows:
                 self._put_last_block(txn)
             metadata = replace(metadata, generation=metadata.generation + 1)
-            _put(txn, schema.METADATA_KEY, metadata.encode())
+            self._put(txn, schema.METADATA_KEY, metadata.encode())
+            self._resize(self._num_new_pages)
             txn.commit()
+            self._resize(0)
             self._txn, self._metadata, self._has_removed = None, metadata, False
+            self._num_new_pages = 0
+
+    def copy_to(self, path: Path) -> None:
+        """Write what was committed to a new file of the same owner and mode, without free pages."""
+        with reporting(self._path):
+            if self._environment is None:
+                raise DatabaseError("this writer is closed")
+            status = os.fstat(self._fd)
+            fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            try:
+                os.fchown(fd, status.st_uid, status.st_gid)
+                os.fchmod(fd, stat.S_IMODE(status.st_mode))
+                self._environment.copyfd(fd, compact=True)
+                os.fsync(fd)
+            finally:
+                os.close(fd)
 
     def close(self) -> None:
         """Drop what was not committed and let other writers in."""
@@ -195,20 +256,39 @@ class MapWriter:
                 if self._txn is None:
                     self._txn = self._environment.begin(write=True)
                 yield self._txn
-            except lmdb.Error as error:
+            except (lmdb.Error, OSError) as error:
                 self.close()
+                reason = error.reason if isinstance(error, lmdb.Error) else error.strerror
                 raise DatabaseError(
-                    f"cannot be written: {error.reason}; is the disk full? The map is as it was "
+                    f"cannot be written: {reason}; is the disk full? The map is as it was "
                     "at the last commit"
                 ) from error
 
-    def _put_last_block(self, txn: lmdb.Transaction) -> None:
-        block = schema.encode_block(np.array(self._scales), np.array(self._rows))
-        _put(txn, schema.block_key((self._num_images - 1) // schema.BLOCK_ROWS), block)
+    def _put(self, txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
+        _put(txn, key, payload)
+        self._num_new_pages += len(payload) // MIN_PAGE_BYTES + PAGES_A_CHANGE
 
-    def _load_block(self, payload: memoryview) -> None:
-        scales, rows = schema.decode_block(payload, self._metadata.model.global_dim)
-        self._scales, self._rows = list(scales), list(rows.copy())
+    def _delete(self, txn: lmdb.Transaction, key: bytes) -> None:
+        txn.delete(key)
+        self._num_new_pages += PAGES_A_CHANGE
+
+    def _resize(self, num_new_pages: int) -> None:
+        """Make the file hold all pages of the last commit, and so many that the next may add.
+
+        LMDB does not write pages that one commit takes and frees again: where these are the last,
+        the file would be shorter than it says, which readers take for a file cut short.
+        """
+        assert self._environment is not None
+        num_pages = self._environment.info()["last_pgno"] + 1 + num_new_pages
+        os.ftruncate(self._fd, num_pages * self._environment.stat()["psize"])
+
+    def _put_last_block(self, txn: lmdb.Transaction) -> None:
+        block = schema.encode_block(self._rows)
+        self._put(txn, schema.block_key((self._num_images - 1) // schema.BLOCK_ROWS), block)
+
+    def _decode_rows(self, payload: memoryview) -> list[schema.Row]:
+        block = schema.decode_block(payload, self._metadata.model.global_dim)
+        return [block.row(place) for place in range(len(block.scales))]
 
 
 def _put(txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
@@ -230,7 +310,8 @@ def _writable_environment(path: Path, fd: int) -> lmdb.Environment:
     return environment
 
 
-def _lock(fd: int) -> None:
+def keep_writers_out(fd: int) -> None:
+    """Be the only writer of an open map file until it is closed; another one is an error."""
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
