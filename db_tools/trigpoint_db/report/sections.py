@@ -13,7 +13,7 @@ from trigpoint.database.reader import MapReader
 from trigpoint.rigid import Rigid3
 from trigpoint_db.coverage import Coverage, Grade, horizontal_axes, mean_up
 from trigpoint_db.coverage_picture import draw_coverage
-from trigpoint_db.evaluate import Evaluation, draw_paths
+from trigpoint_db.evaluate import Evaluation, draw_paths, percentile
 from trigpoint_db.figures import make_figure, to_svg
 from trigpoint_db.gaps import Place
 from trigpoint_db.report.page import Section, Table
@@ -105,7 +105,7 @@ def error_section(positions: Array, rotations_deg: Array, text: str) -> Section:
 
 def _percentile(errors: Array, q: float) -> str:
     """Format a percentile of all images; it is a failure where so many failed."""
-    value = np.sort(errors)[int(np.ceil(q / 100 * (len(errors) - 1)))] if len(errors) else np.inf
+    value = percentile(errors, q)
     return f"{value:.3g}" if np.isfinite(value) else "no pose"
 
 
