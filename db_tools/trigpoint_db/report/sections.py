@@ -74,6 +74,8 @@ def coverage_sections(
 def error_section(positions: Array, rotations_deg: Array, text: str) -> Section:
     """Draw which share of the images is localized within an error; infinite ones are failures."""
     figure = make_figure(8.0, 3.4)
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
     for axes, errors, label in zip(
         figure.subplots(1, 2, sharey=True),
         (positions, rotations_deg),
@@ -91,6 +93,9 @@ def error_section(positions: Array, rotations_deg: Array, text: str) -> Section:
                 color="#3b8bc4",
             )
             axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
         axes.axhline(1.0, color="0.5", linewidth=0.6, linestyle=":")
         axes.set(xlabel=label, ylim=(0, 1.05))
         axes.grid(color="0.5", alpha=0.25)
