@@ -52,7 +52,7 @@ def draw_coverage(
                 *(np.array(places) @ coverage.axes.T).T,
                 MARKERS[grade],
                 color=COLORS[grade],
-                markersize=7,
+                markersize=4 if grade is Grade.STRONG else 7,
                 markeredgecolor="0.5",
                 markeredgewidth=0.5,
                 zorder=4,
@@ -87,7 +87,9 @@ def draw_coverage(
     axes.set(aspect="equal", xlabel="from above, in the map's unit")
     axes.margins(0.08)
     axes.tick_params(labelsize="small")
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize="small")
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=3, fontsize="small", frameon=False
+    )
     return figure
 
 

@@ -62,32 +62,32 @@ class Evaluation:
     @property
     def median_position_m(self) -> float:
         """Median position error."""
-        return _percentile(self.position_errors_m, 50)
+        return percentile(self.position_errors_m, 50)
 
     @property
     def median_rotation_deg(self) -> float:
         """Median rotation error."""
-        return _percentile(self.rotation_errors_deg, 50)
+        return percentile(self.rotation_errors_deg, 50)
 
     @property
     def p90_position_m(self) -> float:
         """90th percentile of the position errors."""
-        return _percentile(self.position_errors_m, 90)
+        return percentile(self.position_errors_m, 90)
 
     @property
     def p90_rotation_deg(self) -> float:
         """90th percentile of the rotation errors."""
-        return _percentile(self.rotation_errors_deg, 90)
+        return percentile(self.rotation_errors_deg, 90)
 
     @property
     def localized_median_position_m(self) -> float:
         """Median position error of the localized queries only."""
-        return _percentile(self.position_errors_m[self.localized], 50)
+        return percentile(self.position_errors_m[self.localized], 50)
 
     @property
     def localized_median_rotation_deg(self) -> float:
         """Median rotation error of the localized queries only."""
-        return _percentile(self.rotation_errors_deg[self.localized], 50)
+        return percentile(self.rotation_errors_deg[self.localized], 50)
 
     @property
     def recalls(self) -> tuple[float, ...]:
@@ -211,7 +211,9 @@ def draw_paths(estimates: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) -> 
     above.set_title("from above", loc="left", fontsize="medium")
     side.set_title("from the side", loc="left", fontsize="medium")
     side.set_xlabel("x (m)")
-    figure.legend(*side.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.legend(
+        *side.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
+    )
     figure.colorbar(
         points, ax=(above, side), label="position error (m)", extend="max", aspect=40, shrink=0.9
     )
@@ -243,14 +245,14 @@ def _draw_view(
         cmap="viridis",
         vmin=0.0,
         vmax=max(np.percentile(errors_m, 95), 1e-6) if len(errors_m) else 1.0,
-        edgecolors="0.3",
+        edgecolors="0.5",
         linewidths=0.3,
         zorder=3,
         label=f"estimate ({len(positions)}{outside})",
     )
     axes.set(xlim=(lower[x], upper[x]), ylim=(lower[y], upper[y]), aspect="equal")
     axes.set_ylabel(f"{'xyz'[y]} (m)")
-    axes.grid(color="0.92")
+    axes.grid(color="0.5", alpha=0.2)
     axes.set_axisbelow(True)
     return points
 
@@ -272,7 +274,7 @@ def _format_length(metres: float) -> str:
     return f"{metres * 1e2:.1f} cm" if metres < 1 else f"{metres:.2f} m"
 
 
-def _percentile(errors: Array, q: float) -> float:
+def percentile(errors: Array, q: float) -> float:
     """Return numpy's default percentile, without its inf - inf = nan; inf of nothing."""
     if len(errors) == 0:
         return math.inf

@@ -13,7 +13,7 @@ from trigpoint.database.reader import MapReader
 from trigpoint.rigid import Rigid3
 from trigpoint_db.coverage import Coverage, Grade, horizontal_axes, mean_up
 from trigpoint_db.coverage_picture import draw_coverage
-from trigpoint_db.evaluate import Evaluation, draw_paths
+from trigpoint_db.evaluate import Evaluation, draw_paths, percentile
 from trigpoint_db.figures import make_figure, to_svg
 from trigpoint_db.gaps import Place
 from trigpoint_db.report.page import Section, Table
@@ -74,6 +74,8 @@ def coverage_sections(
 def error_section(positions: Array, rotations_deg: Array, text: str) -> Section:
     """Draw which share of the images is localized within an error; infinite ones are failures."""
     figure = make_figure(8.0, 3.4)
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
     for axes, errors, label in zip(
         figure.subplots(1, 2, sharey=True),
         (positions, rotations_deg),
@@ -91,6 +93,9 @@ def error_section(positions: Array, rotations_deg: Array, text: str) -> Section:
                 color="#3b8bc4",
             )
             axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
         axes.axhline(1.0, color="0.5", linewidth=0.6, linestyle=":")
         axes.set(xlabel=label, ylim=(0, 1.05))
         axes.grid(color="0.5", alpha=0.25)
@@ -105,7 +110,7 @@ def error_section(positions: Array, rotations_deg: Array, text: str) -> Section:
 
 def _percentile(errors: Array, q: float) -> str:
     """Format a percentile of all images; it is a failure where so many failed."""
-    value = np.sort(errors)[int(np.ceil(q / 100 * (len(errors) - 1)))] if len(errors) else np.inf
+    value = percentile(errors, q)
     return f"{value:.3g}" if np.isfinite(value) else "no pose"
 
 
