@@ -16,7 +16,16 @@ import cv2
 import numpy as np
 
 from trigpoint.database.reader import MapReader
-from trigpoint.frame import Frame, LocalFeatures, Localized, Lost, Reason, Result, Statistics
+from trigpoint.frame import (
+    Frame,
+    LocalFeatures,
+    Localized,
+    Lost,
+    Prior,
+    Reason,
+    Result,
+    Statistics,
+)
 from trigpoint.geometry.joint_refinement import RefinedPose
 from trigpoint.geometry.triangulation import LatentPoints
 from trigpoint.models.features import FeatureModel
@@ -102,13 +111,15 @@ class Localizer:
         self.clock = clock
         self.matcher = matcher or MutualNearestNeighbors()
 
-    def localize(self, frame: Frame) -> Result:
+    def localize(self, frame: Frame, prior: Prior | None = None) -> Result:
         """Estimate cam_from_world of a frame, with covariance, or say why not.
 
+        With a prior position, images from elsewhere are not tried first; they still count against a
+        pose that they would explain as well, so that a wrong prior makes no wrong pose.
         With `try_turned`, a frame that is lost as it is is also tried on its sides and upside down.
         """
         deadline = _Deadline(self.clock, self.options.max_latency_ms)
-        result = self._localize(frame, Statistics(), deadline)
+        result = self._localize(frame, prior, Statistics(), deadline)
         if isinstance(result, Localized) or not self.options.try_turned:
             return result
         if result.reason in (Reason.NO_MAP, Reason.TOO_DARK, Reason.FEW_FEATURES):
@@ -117,7 +128,7 @@ class Localizer:
             if deadline.is_over():
                 break
             start = Statistics(turned_deg=turned_deg, stage_ms=result.statistics.stage_ms)
-            turned = self._localize(frame, start, deadline)
+            turned = self._localize(frame, prior, start, deadline)
             if isinstance(turned, Localized):
                 return turned
         return result
@@ -126,7 +137,9 @@ class Localizer:
         """Solve for the pose with the anchors that a query is matched with, all at once."""
         return self._solve(query, True, _Trace(None, Statistics()))
 
-    def _localize(self, frame: Frame, statistics: Statistics, deadline: _Deadline) -> Result:
+    def _localize(
+        self, frame: Frame, prior: Prior | None, statistics: Statistics, deadline: _Deadline
+    ) -> Result:
         options, trace = self.options, _Trace(self.clock, statistics)
         if len(self.reader) == 0:
             return trace.lost(Reason.NO_MAP, "the map holds no image")
@@ -143,10 +156,14 @@ class Localizer:
 
         with trace.stage("retrieval"):
             indices, similarities = self.reader.search(
-                features.global_descriptor, options.num_anchors, options.anchor_diversity
+                features.global_descriptor,
+                options.num_anchors,
+                options.anchor_diversity,
+                prior=prior,
             )
         if len(indices) < 2:
-            return trace.lost(Reason.FEW_ANCHORS, "the map holds a single image")
+            where = "the map" if prior is None else "the map around the prior position"
+            return trace.lost(Reason.FEW_ANCHORS, f"{where} holds {len(indices)} images")
         retrieved = dict(zip(indices.tolist(), similarities.tolist(), strict=True))
         return self._solve_in_rounds(frame, features, retrieved, trace, deadline)
 

@@ -106,13 +106,13 @@ def test_a_name_that_is_not_there_is_an_error_and_changes_nothing(
 
 
 def test_the_space_of_removed_images_is_used_again(tmp_path: Path) -> None:
-    path = make_map(tmp_path / "a.tpmap", 50)
+    path = make_map(tmp_path / "a.tpmap", 120)
     for _ in range(20):
         with MapWriter.open(path, MODEL) as writer:
             writer.remove("folder/7.png")
         with MapWriter.open(path, MODEL) as writer:
             add(writer, 7)
     size = path.stat().st_size
-    fresh = make_map(tmp_path / "b.tpmap", 50)
+    fresh = make_map(tmp_path / "b.tpmap", 120)
     assert size < 1.5 * fresh.stat().st_size
-    require_images(path, set(range(50)))
+    require_images(path, set(range(120)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +13,11 @@ from typing import Self
 import lmdb
 import numpy as np
 from lmdb.verify import VerifyError, verify
+from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
 from trigpoint.database import schema
+from trigpoint.database.codec import Profile
 from trigpoint.database.pages import DamageError
 from trigpoint.database.snapshot import Snapshot, reporting, share_environment
 from trigpoint.errors import DatabaseError
@@ -39,12 +41,13 @@ class MapWriter:
         self._pose_noise = metadata.pose_noise
         self._has_removed = False  # since the last commit
         self._sessions = list(metadata.sessions)
+        self._index = metadata.index
         self._rows: list[schema.Row] = []  # of the last retrieval block, unless it is full
         self._environment: lmdb.Environment | None = _writable_environment(path, fd)
         self._txn: lmdb.Transaction | None = None
 
     @classmethod
-    def create(cls, path: Path, model: ModelIdentity) -> Self:
+    def create(cls, path: Path, model: ModelIdentity, profile: Profile = Profile.STANDARD) -> Self:
         """Make an empty map for features of a model."""
         with reporting(path), ExitStack() as undo:
             try:
@@ -56,7 +59,7 @@ class MapWriter:
             undo.callback(path.unlink)
             undo.callback(os.close, fd)
             _lock(fd)
-            metadata = schema.Metadata(model)
+            metadata = schema.Metadata(model, profile=profile)
             environment = _writable_environment(path, fd)
             with environment.begin(write=True) as txn:
                 _put(txn, schema.METADATA_KEY, metadata.encode())
@@ -96,15 +99,25 @@ class MapWriter:
             _require_name(name)
             _require_pose(name, cam_from_world)
             _require_features(name, features, camera, self._metadata.model)
-            image, arrays = schema.encode_image(name, camera, cam_from_world, features)
+            image, arrays = schema.encode_image(
+                name, camera, cam_from_world, features, self._metadata.profile
+            )
             scale, numbers = schema.quantize_row(features.global_descriptor)
-            row = schema.Row(scale, schema.NO_SESSION, numbers)
-            return self._append(txn, name, schema.Record(image, arrays, row, session))
+            center = cam_from_world.center.astype(np.float32)
+            row = schema.Row(scale, center, schema.NO_SESSION, numbers)
+            return self._append(
+                txn, name, schema.Record(image, arrays, row, session, self._metadata.profile)
+            )
 
     def add_record(self, name: str, record: schema.Record) -> int:
-        """Add an image as it lies in another map of the same model, and return its index."""
+        """Add an image as it lies in another map of the same model, and return its index.
+
+        Where the profiles differ, its descriptors are written as this map has them.
+        """
         with self._writing() as txn:
             _require_name(name)
+            own, dim = self._metadata.profile, self._metadata.model.descriptor_dim
+            record = schema.recode(record, dim, own)
             image = schema.rename_image(record.image, name)
             return self._append(txn, name, replace(record, image=image))
 
@@ -150,6 +163,7 @@ class MapWriter:
                 txn.delete(key)
             if not self._rows:
                 txn.delete(schema.block_key(last // schema.BLOCK_ROWS))
+            self._note_moved(index, last)
             self._num_images, self._has_removed = last, True
 
     def _move(self, txn: lmdb.Transaction, source: int, target: int, row: schema.Row) -> None:
@@ -167,6 +181,27 @@ class MapWriter:
         rows[place] = row
         _put(txn, key, schema.encode_block(rows))
 
+    def _note_moved(self, *indices: int) -> None:
+        """Remember that the index knows other rows of these indices."""
+        if self._index is not None:
+            moved = {*self._index.moved, *(i for i in indices if i < self._index.num_rows)}
+            self._index = replace(self._index, moved=tuple(sorted(moved)))
+
+    def put_index(
+        self,
+        num_rows: int,
+        centroids: NDArray[np.float32],
+        lists: Iterable[tuple[NDArray[np.intp], schema.Block]],
+    ) -> None:
+        """Put an index of the first rows, lists of indices and rows, in the place of the old."""
+        with self._writing() as txn:
+            for number in range(0 if self._index is None else self._index.num_lists):
+                txn.delete(schema.list_key(number))
+            _put(txn, schema.CENTROIDS_KEY, schema.encode_centroids(centroids))
+            for number, (indices, rows) in enumerate(lists):
+                _put(txn, schema.list_key(number), schema.encode_list(indices, rows))
+            self._index = schema.InvertedFile(num_rows, len(centroids))
+
     def set_pose_noise(self, noise: PoseNoise | None) -> None:
         """Say how well the poses of the map agree, None if that is not known."""
         self._pose_noise = noise
@@ -178,6 +213,7 @@ class MapWriter:
             num_images=self._num_images,
             pose_noise=self._pose_noise,
             sessions=tuple(self._sessions),
+            index=self._index,
         )
         if metadata == self._metadata and not self._has_removed:
             return
