@@ -14,8 +14,8 @@ EXTRAS ?=
 LIB = $(DESTDIR)$(PREFIX)/lib
 SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
-.PHONY: demo test test-oak test-systemd test-v4l2 check golden
-.PHONY: bench bench-models bench-localizer wheel-test clean
+.PHONY: demo test kill-test test-oak test-systemd test-v4l2 check golden
+.PHONY: bench bench-models bench-localizer bench-maps wheel-test clean
 .PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
@@ -45,6 +45,10 @@ check: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python -m pytest
+
+# A map changed by processes that are killed at random moments; half a minute.
+kill-test: $(READY)
+	$(BIN)/python -m tests.unit.run_kills 200
 
 # The camera source on a real kernel's virtual camera, in qemu; about a minute.
 test-v4l2: $(READY)
@@ -89,6 +93,11 @@ bench-localizer: $(READY)
 	$(BIN)/python -m benchmarks.localizer $(DATA) \
 	  $(if $(HLOC),--hloc '$(HLOC)') $(if $(EDGEPOINT2),--edgepoint2 '$(EDGEPOINT2)') \
 	  --output build/bench/localizer.md --picture build/bench/reliability.png
+
+# Profiles of maps, and retrieval in maps of up to a million images; half an hour and 2 GB.
+bench-maps: $(READY)
+	@mkdir -p build/bench
+	$(BIN)/python -m benchmarks.maps $(DATA) --output build/bench/maps.md
 
 # The suite against the installed wheel, not the checkout.
 wheel-test: $(READY)

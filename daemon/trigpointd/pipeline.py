@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from trigpoint.database.reader import MapReader
-from trigpoint.errors import DatabaseError, ModelError
-from trigpoint.frame import Failed, Frame, Localized, Result, describe, summarize
+from trigpoint.errors import ConfigError, DatabaseError, ModelError
+from trigpoint.frame import Failed, Frame, Localized, Prior, Result, describe, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import load_matcher
@@ -89,10 +89,10 @@ class Pipeline:
         }
         return Output(captured, result, pose, json.dumps(status).encode())
 
-    def localize(self, frame: Frame | BadFrame) -> Result | Failed:
+    def localize(self, frame: Frame | BadFrame, prior: Prior | None = None) -> Result | Failed:
         """Localize one frame in the map as it is now."""
         self._refresh_map()
-        return self._localize(frame)
+        return self._localize(frame, prior)
 
     def _refresh_map(self) -> None:
         """Take up what was added to the map; where that cannot be used, keep what there was."""
@@ -100,24 +100,35 @@ class Pipeline:
         try:
             if self.reader.refresh():
                 _log.info("the map is now of generation %d", self.reader.generation)
+                self._look_for_sessions()
         except DatabaseError as error:
             problem = str(error)
         if problem and problem != self._map_problem:
             _log.error("%s; going on with the map as it was", problem)
         self._map_problem = problem
 
-    def _localize(self, frame: Frame | BadFrame) -> Result | Failed:
+    def _look_for_sessions(self) -> None:
+        try:
+            self.localizer.check_sessions()
+        except ConfigError as error:
+            self._report(f"{error}; going on without it")
+
+    def _localize(self, frame: Frame | BadFrame, prior: Prior | None) -> Result | Failed:
         if isinstance(frame, BadFrame):
             return Failed("BAD_FRAME", frame.detail)
         try:
-            return self.localizer.localize(frame)
+            return self.localizer.localize(frame, prior)
         except (DatabaseError, ModelError) as error:
             # A damaged image of the map, or a network that fails on this frame: others may do.
-            if str(error) not in self._reported:
-                self._reported.add(str(error))
-                _log.error("%s", error)
+            self._report(str(error))
             reason = "BAD_MAP" if isinstance(error, DatabaseError) else "BAD_NETWORK"
             return Failed(reason, str(error))
+
+    def _report(self, problem: str) -> None:
+        """Say once what is wrong."""
+        if problem not in self._reported:
+            self._reported.add(problem)
+            _log.error("%s", problem)
 
 
 @contextlib.contextmanager
@@ -134,4 +145,5 @@ def open_pipeline(config: Config) -> Iterator[Pipeline]:
         localizer = Localizer(
             model, reader, config.localizer, clock=time.perf_counter, matcher=matcher
         )
+        localizer.check_sessions()
         yield Pipeline(localizer, reader, config.camera.body_from_camera, config.map_frame)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import glob
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from trigpoint.camera import Camera
+from trigpoint.database.codec import Profile
+from trigpoint.database.reader import MapReader
+from trigpoint.database.replacing import COMMIT_EVERY, new_map
 from trigpoint.database.writer import MapWriter
-from trigpoint.errors import ConfigError, DatabaseError
-from trigpoint.frame import Frame
+from trigpoint.errors import ConfigError
+from trigpoint.frame import Frame, Session
 from trigpoint.images import read_gray
 from trigpoint.models.features import FeatureModel
 from trigpoint_db.importers.colmap import PosedImage
-
-COMMIT_EVERY = 100  # images; until then they are in memory
 
 
 def select_images(images: Sequence[PosedImage], names: Sequence[str]) -> list[PosedImage]:
@@ -29,6 +27,22 @@ def select_images(images: Sequence[PosedImage], names: Sequence[str]) -> list[Po
             f"such as {unknown[0]!r}"
         )
     return [by_name[name] for name in names]
+
+
+def select_new(
+    images: Sequence[PosedImage], path: Path, *, skip_existing: bool
+) -> list[PosedImage]:
+    """Keep the images that a map does not have; unless they may be skipped, others are an error."""
+    with MapReader.open(path) as reader:
+        names = set(reader.names())
+    new = [image for image in images if image.name not in names]
+    if len(new) < len(images) and not skip_existing:
+        known = next(image.name for image in images if image.name in names)
+        raise ConfigError(
+            f"{path} holds {len(images) - len(new)} of {len(images)} images already, such as "
+            f"{known!r}; leave them out with --skip-existing"
+        )
+    return new
 
 
 def check_files(names: Iterable[str], folder: Path) -> None:
@@ -53,46 +67,16 @@ def build_map(
     model: FeatureModel,
     *,
     max_keypoints: int = 1024,
+    session: Session | None = None,
+    profile: Profile = Profile.STANDARD,
 ) -> int:
     """Write a new map; it appears under its name when it is complete. Returns the image count."""
-    refuse_existing(path)
-    _remove_leftovers(path)
-    # Under a name of its own, so that two builds at once do not meet.
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        with MapWriter.create(partial, model.identity) as writer:
-            for image in images:
-                _add(writer, image, folder, model, max_keypoints)
-                if len(writer) % COMMIT_EVERY == 0:
-                    writer.commit()
-            count = len(writer)
-        refuse_existing(path)
-        partial.rename(path)
-    except DatabaseError as error:
-        raise DatabaseError(str(error).replace(str(partial), str(path))) from error
-    finally:
-        _remove(partial)
-    return count
-
-
-def _remove(partial: Path) -> None:
-    for leftover in (partial, partial.with_name(partial.name + "-lock")):
-        with contextlib.suppress(OSError):
-            leftover.unlink()
-
-
-def _remove_leftovers(path: Path) -> None:
-    """Remove what builds that were killed have left."""
-    for partial in path.parent.glob(f"{glob.escape(path.name)}.*.partial"):
-        owner = partial.name.removesuffix(".partial").rpartition(".")[2]
-        if owner.isdecimal() and not Path("/proc", owner).exists():
-            _remove(partial)
-
-
-def refuse_existing(path: Path) -> None:
-    """Keep a map that is there."""
-    if path.exists():
-        raise ConfigError(f"{path} exists; remove it first, or add to it with --append")
+    with new_map(path, model.identity, profile) as writer:
+        for image in images:
+            _add(writer, image, folder, model, max_keypoints, session)
+            if len(writer) % COMMIT_EVERY == 0:
+                writer.commit()
+        return len(writer)
 
 
 def append_map(
@@ -102,18 +86,25 @@ def append_map(
     model: FeatureModel,
     *,
     max_keypoints: int = 1024,
+    session: Session | None = None,
 ) -> int:
-    """Add images to a map, all or none of them. Returns how many."""
+    """Add images to a map, each of which is there for good once it is added. Returns how many."""
     with MapWriter.open(path, model.identity) as writer:
         before = len(writer)
         for image in images:
-            _add(writer, image, folder, model, max_keypoints)
+            _add(writer, image, folder, model, max_keypoints, session)
+            writer.commit()
         return len(writer) - before
 
 
 def _add(
-    writer: MapWriter, image: PosedImage, folder: Path, model: FeatureModel, max_keypoints: int
+    writer: MapWriter,
+    image: PosedImage,
+    folder: Path,
+    model: FeatureModel,
+    max_keypoints: int,
+    session: Session | None,
 ) -> None:
     frame = read_frame(folder / image.name, image.camera, image.name)
     features = model.extract(frame.image, max_keypoints)
-    writer.add(image.name, image.camera, image.cam_from_world, features)
+    writer.add(image.name, image.camera, image.cam_from_world, features, session)

@@ -7,20 +7,19 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 import threadpoolctl
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from trigpoint.camera import Camera
+from trigpoint.database.codec import Profile
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError, SourceError, TrigpointError
 from trigpoint.frame import Failed, Localized, PoseNoise, describe, summarize
@@ -31,44 +30,60 @@ from trigpoint.options import LocalizerOptions
 from trigpoint.output import check_output, open_text
 from trigpoint.rigid import Rigid3
 from trigpoint_db.adapt import adapt_model
-from trigpoint_db.build import append_map, build_map, check_files, select_images
+from trigpoint_db.build import (
+    append_map,
+    build_map,
+    check_files,
+    select_images,
+    select_new,
+)
 from trigpoint_db.calibrate import calibrate_map
+from trigpoint_db.cli_maps import app as maps
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import localize_images
-from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
+from trigpoint_db.maps import count_sessions
+from trigpoint_db.poses import (
+    Query,
+    read_names,
+    read_poses,
+    read_priors,
+    read_queries,
+    write_poses,
+)
 from trigpoint_db.recording import FORMATS, RecordedImage, write_recording
 from trigpoint_db.recover import recover
+from trigpoint_db.terminal import (
+    Json,
+    MapPath,
+    MapProfile,
+    Model,
+    Retrieval,
+    SessionDate,
+    SessionName,
+    console,
+    make_session,
+    track,
+    track_calibration,
+)
 
-T = TypeVar("T")
 app = typer.Typer(
     help="Off-line tools on maps, recordings and results.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-console = Console()
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
-Model = Annotated[str, typer.Option(help="The network: tiny, base, large, or a file (.onnx).")]
-Retrieval = Annotated[
-    Path | None, typer.Option(help="A retrieval network, where the other needs one beside it.")
-]
-MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="A .tpmap file.")]
+
+
+app.add_typer(maps)  # on the same level
 
 
 @app.callback()
 def _set_up() -> None:
     # As in the daemon: OpenBLAS's threads spin while they wait for each other.
     threadpoolctl.threadpool_limits(1, user_api="blas")
-
-
-def track(items: Iterable[T], what: str, total: int) -> Iterator[T]:
-    """Show a progress bar on standard error, which keeps standard output clean."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
-        yield from progress.track(items, total=total, description=what)
 
 
 @app.command()
@@ -78,24 +93,41 @@ def build(
     images: Annotated[Path, typer.Option(help="Folder of the images.")],
     list_: Annotated[Path | None, typer.Option("--list", help="Only these names.")] = None,
     append: Annotated[bool, typer.Option("--append", help="Add to a map.")] = False,
+    skip_existing: Annotated[
+        bool, typer.Option("--skip-existing", help="Leave out images that the map has.")
+    ] = False,
+    session: SessionName = None,
+    date: SessionDate = None,
     keypoints: Annotated[int, typer.Option(help="At most so many an image.", min=50)] = 1024,
+    profile: MapProfile = None,
     model: Model = "base",
     retrieval: Retrieval = None,
     as_json: Json = False,
 ) -> None:
     """Make a map from images with known poses."""
+    survey = make_session(session, date)
     posed = read_model(colmap)
     if list_ is not None:
         posed = select_images(posed, read_names(list_))
     if not posed:
         raise ConfigError(f"there are no images to map: {list_ or colmap} names none")
     check_output(map_)
+    if append:
+        require_profile(map_, profile)
+        posed = select_new(posed, map_, skip_existing=skip_existing)
     check_files((image.name for image in posed), images)
-    write = append_map if append else build_map
     network = FeatureModel.load(model, retrieval=retrieval)
-    count = write(
-        map_, track(posed, "mapping", len(posed)), images, network, max_keypoints=keypoints
-    )
+    images_to_map = track(posed, "mapping", len(posed))
+    arguments = (map_, images_to_map, images, network)
+    if append:
+        count = append_map(*arguments, max_keypoints=keypoints, session=survey)
+    else:
+        count = build_map(
+            *arguments,
+            max_keypoints=keypoints,
+            session=survey,
+            profile=profile or Profile.STANDARD,
+        )
     noise = calibrate_map(map_, network, track_calibration)
     size = map_.stat().st_size
     if as_json:
@@ -103,6 +135,16 @@ def build(
         print(json.dumps(facts | {"pose_noise": noise and asdict(noise)}))
     else:
         print(f"{map_}: {count} images added, {size / 1e6:.1f} MB; {describe_noise(noise)}")
+
+
+def require_profile(map_: Path, profile: Profile | None) -> None:
+    """Refuse to add to a map of another profile than was asked for."""
+    with MapReader.open(map_) as reader:
+        if profile not in (None, reader.profile):
+            raise ConfigError(
+                f"{map_} is of the {reader.profile} profile, and images added are of it too; "
+                "leave --profile out"
+            )
 
 
 @app.command()
@@ -129,11 +171,6 @@ def describe_noise(noise: PoseNoise | None) -> str:
     )
 
 
-def track_calibration(images: list[int]) -> Iterator[int]:
-    """Show a progress bar of a calibration."""
-    return track(images, "calibrating", len(images))
-
-
 @app.command()
 def localize(
     map_: MapPath,
@@ -142,6 +179,9 @@ def localize(
     poses: Annotated[Path, typer.Option(help="Write `name qw qx qy qz tx ty tz`.")],
     results: Annotated[Path | None, typer.Option(help="Write a JSON line a query.")] = None,
     anchors: Annotated[int, typer.Option(help="How many to retrieve.", min=2)] = 20,
+    priors: Annotated[
+        Path | None, typer.Option(help="Lines `name x y z radius`: images elsewhere do not count.")
+    ] = None,
     model: Model = "base",
     retrieval: Retrieval = None,
     matcher: Annotated[
@@ -155,6 +195,9 @@ def localize(
     wanted = read_queries(queries)
     if not wanted:
         raise ConfigError(f"{queries} names no images")
+    around = {} if priors is None else read_priors(priors)
+    if priors is not None and not any(query.name in around for query in wanted):
+        raise ConfigError(f"{priors} names none of the images in {queries}")
     check_files((query.name for query in wanted), images)
     network = FeatureModel.load(model, retrieval=retrieval)
     matching = load_matcher(matcher, network.identity.descriptor_dim)
@@ -164,7 +207,7 @@ def localize(
             raise ConfigError(f"{map_} holds no images; add some: trigpoint-db build --append")
         lines = None if results is None else stack.enter_context(open_text(results))
         localizer = Localizer(network, reader, options, time.perf_counter, matching)
-        localized = localize_images(localizer, wanted, images)
+        localized = localize_images(localizer, wanted, images, around)
         outcomes = []
         for outcome in track(localized, "localizing", len(wanted)):
             outcomes.append(outcome)
@@ -238,9 +281,12 @@ def info(map_: MapPath, as_json: Json = False) -> None:
             "generation": reader.generation,
             "model": reader.model.name,
             "model_sha256": reader.model.sha256,
+            "profile": reader.profile,
+            "has_index": reader.has_index,
             "descriptor_dim": reader.model.descriptor_dim,
             "global_dim": reader.model.global_dim,
             "pose_noise": reader.pose_noise and asdict(reader.pose_noise),
+            "sessions": count_sessions(reader),
             "bytes": map_.stat().st_size,
             "min_center": centers.min(axis=0).tolist() if len(centers) else None,
             "max_center": centers.max(axis=0).tolist() if len(centers) else None,
@@ -249,6 +295,9 @@ def info(map_: MapPath, as_json: Json = False) -> None:
         print(json.dumps(facts))
         return
     table = Table(show_header=False)
+    for session in facts.pop("sessions"):
+        about = f"session {session['name'] or 'none'}", session["date"] or ""
+        table.add_row(" ".join(about), f"{session['num_images']} images")
     for key, value in facts.items():
         table.add_row(key, str(value))
     console.print(table)

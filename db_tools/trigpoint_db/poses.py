@@ -10,6 +10,7 @@ from pathlib import Path
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
+from trigpoint.frame import Prior
 from trigpoint.output import check_output
 from trigpoint.poses import format_pose
 from trigpoint.rigid import Rigid3
@@ -69,6 +70,23 @@ def read_poses(path: Path) -> dict[str, Rigid3]:
         _check_new(where, name, poses)
         poses[name] = pose_from_numbers(where, values)
     return poses
+
+
+def read_priors(path: Path) -> dict[str, Prior]:
+    """Read `name x y z radius` lines: where the camera of each query was about."""
+    priors: dict[str, Prior] = {}
+    for where, line in _read_entries(path):
+        name, *numbers = line.rsplit(maxsplit=4)
+        try:
+            x, y, z, radius = (float(number) for number in numbers)
+        except ValueError:
+            raise ConfigError(f"{where}: expected 'name x y z radius', not {line[:80]!r}") from None
+        _check_new(where, name, priors)
+        try:
+            priors[name] = Prior((x, y, z), radius)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
+    return priors
 
 
 def write_poses(path: Path, poses: Mapping[str, Rigid3]) -> None:

@@ -223,6 +223,7 @@ class Statistics:
     turned_deg: int = 0  # counterclockwise, of the image that the features are of
     generator: str = ""  # which hypothesis was refined: "anchor_pairs" or "latent_points"
     anchors: tuple[str, ...] = ()  # names, best first
+    anchor_inliers: tuple[int, ...] = ()  # of the last pose: how many each anchor sees
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from trigpoint.database.reader import MapReader
+from trigpoint.errors import ConfigError
 from trigpoint.frame import (
     Frame,
     LocalFeatures,
@@ -37,6 +38,7 @@ from trigpoint.stages import (
     Query,
     average_poses,
     calibrate_covariance,
+    count_by_anchor,
     count_support,
     estimate_relative_poses,
     extract_turned,
@@ -111,6 +113,17 @@ class Localizer:
         self.clock = clock
         self.matcher = matcher or MutualNearestNeighbors()
 
+    def check_sessions(self) -> None:
+        """Raise ConfigError where the options name a session that the map does not have."""
+        known = {session.name for session in self.reader.sessions}
+        for option in ("prefer_sessions", "exclude_sessions"):
+            for name in getattr(self.options, option):
+                if name not in known:
+                    raise ConfigError(
+                        f"{option} has {name!r}, a session that the map does not have; "
+                        f"it has {', '.join(sorted(known)) or 'none'}"
+                    )
+
     def localize(self, frame: Frame, prior: Prior | None = None) -> Result:
         """Estimate cam_from_world of a frame, with covariance, or say why not.
 
@@ -159,11 +172,13 @@ class Localizer:
                 features.global_descriptor,
                 options.num_anchors,
                 options.anchor_diversity,
+                prefer=options.prefer_sessions,
+                exclude=options.exclude_sessions,
                 prior=prior,
             )
         if len(indices) < 2:
-            where = "the map" if prior is None else "the map around the prior position"
-            return trace.lost(Reason.FEW_ANCHORS, f"{where} holds {len(indices)} images")
+            detail = f"the map holds {len(indices) or 'no'} image that may be used"
+            return trace.lost(Reason.FEW_ANCHORS, detail)
         retrieved = dict(zip(indices.tolist(), similarities.tolist(), strict=True))
         return self._solve_in_rounds(frame, features, retrieved, trace, deadline)
 
@@ -225,7 +240,9 @@ class Localizer:
         points3d = solution.seen.points3d
         points3d = points3d[:: math.ceil(len(points3d) / MAX_SHOWN)]
         support = [retrieved.get(taken[view], 0.0) for view in np.unique(solution.seen.tracks.view)]
-        found, similarities = self.reader.search(features.global_descriptor, NUM_LOOK_ALIKE)
+        found, similarities = self.reader.search(
+            features.global_descriptor, NUM_LOOK_ALIKE, exclude=self.options.exclude_sessions
+        )
         num_alike = int((similarities > max(support) - MAX_LESS_ALIKE).sum())
         elsewhere: list[int] = []
         for i, index in enumerate(found.tolist()):
@@ -287,6 +304,7 @@ class Localizer:
             trace.note(
                 num_inliers=evidence.num_inliers,
                 num_rivals=evidence.num_rivals,
+                anchor_inliers=count_by_anchor(query, latent, refined.inliers),
                 spread_px=evidence.spread_px,
                 depth=evidence.depth,
                 confidence=confidence,

@@ -307,6 +307,14 @@ def mean_distance(query: Query, latent: LatentPoints, cam_from_world: Rigid3) ->
     return float(np.linalg.norm(centers - cam_from_world.center, axis=1).mean())
 
 
+def count_by_anchor(
+    query: Query, latent: LatentPoints, inliers: NDArray[np.bool_]
+) -> tuple[int, ...]:
+    """Count for each anchor the latent points (M,), of those that are inliers, that it sees."""
+    seen = latent.tracks.view[np.repeat(inliers, latent.tracks.lengths)]
+    return tuple(np.bincount(seen, minlength=len(query.views)).tolist())
+
+
 def calibrate_covariance(
     covariance: Array, distance: float, map_noise: PoseNoise, options: LocalizerOptions
 ) -> Array:

@@ -144,6 +144,9 @@ def main(task: str, path: Path) -> None:
     if task == "read-without-rights":
         read_without_rights(path)
         return
+    if task == "check-on-demand":
+        check_on_demand(path)
+        return
     with MapWriter.open(path, MODEL) as writer:
         if task == "add-forever":
             while True:
@@ -184,6 +187,15 @@ def read_without_rights(path: Path) -> None:
                     say(error)
     except DatabaseError as error:
         say(error)
+
+
+def check_on_demand(path: Path) -> None:
+    with MapReader.open(path) as reader:
+        say(f"{len(reader)} images, {reader.verify() or 'no problems'}")
+        for line in sys.stdin:
+            if line == "refresh\n":
+                reader.refresh()
+            say(f"{len(reader)} images, {reader.verify() or 'no problems'}")
 
 
 def say(what: object) -> None:

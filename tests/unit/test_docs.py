@@ -18,7 +18,9 @@ pytestmark = pytest.mark.skipif(not DOCS.is_dir(), reason="needs the checkout's 
 def test_every_setting_of_the_localizer_is_listed_with_its_default() -> None:
     rows = re.findall(r"^\| `(\w+)` \| (\S+) \|", (DOCS / "configuration.md").read_text(), re.M)
     defaults = {
-        field.name: {"None": "off", "False": "false"}.get(str(field.default), str(field.default))
+        field.name: {"None": "off", "False": "false", "()": "[]"}.get(
+            str(field.default), str(field.default)
+        )
         for field in dataclasses.fields(LocalizerOptions)
     }
     assert {name: value.strip('"') for name, value in rows} == defaults

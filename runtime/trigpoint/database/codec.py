@@ -40,7 +40,8 @@ def encode_descriptors(descriptors: Array32, profile: Profile) -> bytes:
     numbers = descriptors @ rotation[:, : descriptors.shape[1]].T  # standard deviation 1
     codes = np.searchsorted(np.array([-_THRESHOLD, 0, _THRESHOLD]), numbers).astype(np.uint8)
     places = codes.reshape(-1, _PER_BYTE) << np.arange(0, 2 * _PER_BYTE, 2, dtype=np.uint8)
-    return np.bitwise_or.reduce(places, axis=1).tobytes()
+    packed: NDArray[np.uint8] = np.bitwise_or.reduce(places, axis=1)
+    return packed.tobytes()
 
 
 def decode_descriptors(payload: memoryview, dim: int, profile: Profile) -> NDArray[np.int8]:
@@ -65,11 +66,13 @@ def _rotation(dim: int) -> Array32:
     i = np.arange(max(_PER_BYTE, 1 << (dim - 1).bit_length()))
     hadamard = np.bitwise_count(i[:, None] & i) % 2
     signs = np.bitwise_count(i & i >> 1) % 2
-    return (1.0 - 2.0 * (hadamard ^ signs)).astype(np.float32)
+    rotation: Array32 = (1.0 - 2.0 * (hadamard ^ signs)).astype(np.float32)
+    return rotation
 
 
 @cache
 def _levels_of_bytes() -> Array32:
     """Return the four levels in each byte: (256, 4)."""
     codes = np.arange(256)[:, None] >> np.arange(0, 2 * _PER_BYTE, 2) & 3
-    return _LEVELS[codes].astype(np.float32)
+    levels: Array32 = _LEVELS[codes].astype(np.float32)
+    return levels

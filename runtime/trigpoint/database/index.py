@@ -43,20 +43,21 @@ def build_index(path: Path, track: Callable[[range], Iterable[int]] = iter) -> i
             rows, num_rows = Retrieval(snapshot), snapshot.metadata.num_images
             if num_rows == 0:
                 return 0
-            num_lists = math.ceil(4 * math.sqrt(num_rows))
-            centroids = _find_centroids(rows, num_rows, num_lists)
-            list_of = np.concatenate([assign(b.descriptors, centroids) for b in rows.blocks()])
-            ends = np.cumsum(np.bincount(list_of, minlength=num_lists))
+            centroids = _find_centroids(rows, num_rows)
+            nearest = np.concatenate([assign(b.descriptors, centroids) for b in rows.blocks()])
+            used, list_of = np.unique(nearest, return_inverse=True)
+            ends = np.cumsum(np.bincount(list_of))
             members = np.split(np.argsort(list_of, kind="stable"), ends[:-1])
-            lists = ((members[i], rows.gather(members[i])) for i in track(range(num_lists)))
-            writer.put_index(num_rows, centroids, lists)
-        return num_lists
+            lists = ((members[i], rows.gather(members[i])) for i in track(range(len(used))))
+            writer.put_index(num_rows, centroids[used], lists)
+        return len(used)
 
 
-def _find_centroids(rows: Retrieval, num_rows: int, num_lists: int) -> Array32:
+def _find_centroids(rows: Retrieval, num_rows: int) -> Array32:
+    num_lists = math.ceil(4 * math.sqrt(num_rows))
     num_samples = min(num_rows, _SAMPLES_PER_LIST * num_lists)
-    rng = np.random.default_rng(0)
-    return cluster(rows.descriptors(rng.choice(num_rows, num_samples, replace=False)), num_lists)
+    sample = np.random.default_rng(0).choice(num_rows, num_samples, replace=False)
+    return cluster(rows.descriptors(sample), num_lists)
 
 
 def cluster(samples: Array32, num_lists: int) -> Array32:

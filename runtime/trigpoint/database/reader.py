@@ -93,6 +93,11 @@ class MapReader:
         """What it spends on an image."""
         return self._current.metadata.profile
 
+    @property
+    def has_index(self) -> bool:
+        """Whether `search` compares with some of the images only."""
+        return self._current.metadata.index is not None
+
     def __len__(self) -> int:
         return self._current.metadata.num_images
 
@@ -130,8 +135,10 @@ class MapReader:
             _require_index(snapshot, index)
             block, place = divmod(index, schema.BLOCK_ROWS)
             row = self._rows.block(block).row(place)
+            image = bytes(snapshot.get(schema.image_key(index)))
             return schema.Record(
-                bytes(snapshot.get(schema.image_key(index))),
+                schema.decode_name(memoryview(image)),
+                image,
                 bytes(snapshot.get(schema.features_key(index))),
                 row,
                 (None, *self.sessions)[row.session],
@@ -234,10 +241,10 @@ class MapReader:
                 with _collecting(problems):
                     rows.block(block)
             wanted = 1 + 3 * len(self) + rows.num_blocks
-            if (index := snapshot.metadata.index) is not None:
-                wanted += 1 + index.num_lists
+            if (inverted := snapshot.metadata.index) is not None:
+                wanted += 1 + inverted.num_lists
                 with _collecting(problems):
-                    rows.check_index(index)
+                    rows.check_index(inverted)
             found = snapshot.count_entries()
             if found != wanted:
                 problems.append(f"there are {found} entries where {wanted} belong")

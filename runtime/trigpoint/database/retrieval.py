@@ -33,7 +33,7 @@ class Candidates(NamedTuple):
         """Return the `num` of the highest scores, highest first, equal ones by index."""
         order = np.argsort(self.indices, kind="stable")
         order = order[find_largest(self.scores[order], num)]
-        return Candidates(*(values[order] for values in self))
+        return Candidates._make(values[order] for values in self)
 
 
 class Retrieval:
@@ -84,7 +84,7 @@ class Retrieval:
         return descriptors
 
     def gather(self, indices: Index) -> schema.Block:
-        """Copy rows (K,), whose indices rise, together."""
+        """Put rows (K,), at least one, whose indices rise, together."""
         return schema.Block.concatenate([block for _, block in self.rows(indices)])
 
     @cached_property
@@ -137,7 +137,7 @@ class Retrieval:
         if not found:
             nothing = np.empty(0, np.float32)
             return Candidates(np.empty(0, np.intp), nothing, nothing)
-        return Candidates(*map(np.concatenate, zip(*found, strict=True))).best(num)
+        return Candidates._make(map(np.concatenate, zip(*found, strict=True))).best(num)
 
     def indexed(self, number: int) -> tuple[Index, schema.Block]:
         """Return a list of the index: the rows it knew, and their indices (n,) at that time."""

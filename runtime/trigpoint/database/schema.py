@@ -182,6 +182,7 @@ class Metadata:
 class Record:
     """An image as it lies in a map, ready for another one; `row.session` is the former's."""
 
+    name: str
     image: bytes
     features: bytes
     row: Row
@@ -344,7 +345,7 @@ class Block(NamedTuple):
     @classmethod
     def concatenate(cls, blocks: Sequence[Block]) -> Block:
         """Put blocks, at least one, together."""
-        return cls(*map(np.concatenate, zip(*blocks, strict=True)))
+        return cls._make(map(np.concatenate, zip(*blocks, strict=True)))
 
     @property
     def descriptors(self) -> Array32:
@@ -364,7 +365,7 @@ class Block(NamedTuple):
         """Return some of them, in this order; all of them without a copy."""
         if len(places) == len(self.scales):
             return self
-        return Block(*(values[places] for values in self))
+        return Block._make(values[places] for values in self)
 
     def encode(self) -> bytes:
         """Write them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import stat
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
@@ -19,7 +20,12 @@ from trigpoint.camera import Camera
 from trigpoint.database import schema
 from trigpoint.database.codec import Profile
 from trigpoint.database.pages import DamageError
-from trigpoint.database.snapshot import Snapshot, reporting, share_environment
+from trigpoint.database.snapshot import (
+    Snapshot,
+    reporting,
+    require_in_place,
+    share_environment,
+)
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import LocalFeatures, ModelIdentity, PoseNoise, Session
 from trigpoint.rigid import Rigid3
@@ -47,8 +53,14 @@ class MapWriter:
         self._txn: lmdb.Transaction | None = None
 
     @classmethod
-    def create(cls, path: Path, model: ModelIdentity, profile: Profile = Profile.STANDARD) -> Self:
-        """Make an empty map for features of a model."""
+    def create(
+        cls,
+        path: Path,
+        model: ModelIdentity,
+        profile: Profile = Profile.STANDARD,
+        generation: int = 0,
+    ) -> Self:
+        """Make an empty map for features of a model, of the generation that goes before."""
         with reporting(path), ExitStack() as undo:
             try:
                 fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
@@ -59,7 +71,7 @@ class MapWriter:
             undo.callback(path.unlink)
             undo.callback(os.close, fd)
             _lock(fd)
-            metadata = schema.Metadata(model, profile=profile)
+            metadata = schema.Metadata(model, generation, profile=profile)
             environment = _writable_environment(path, fd)
             with environment.begin(write=True) as txn:
                 _put(txn, schema.METADATA_KEY, metadata.encode())
@@ -74,6 +86,12 @@ class MapWriter:
             fd = os.open(path, os.O_RDWR)
             undo.callback(os.close, fd)
             _lock(fd)
+            require_in_place(path, fd)
+            Snapshot(path, model).close()  # before LMDB writes to the lock file
+            environment = _writable_environment(path, fd)
+            # A writer killed at the end of its commit leaves all but the next writer at the commit
+            # before: without this, the metadata would be those of another tree.
+            environment.begin(write=True).abort()
             with closing(Snapshot(path, model)) as snapshot:
                 _require_sound(path)
                 writer = cls(path, fd, snapshot.metadata)
@@ -105,12 +123,11 @@ class MapWriter:
             scale, numbers = schema.quantize_row(features.global_descriptor)
             center = cam_from_world.center.astype(np.float32)
             row = schema.Row(scale, center, schema.NO_SESSION, numbers)
-            return self._append(
-                txn, name, schema.Record(image, arrays, row, session, self._metadata.profile)
-            )
+            profile = self._metadata.profile
+            return self._append(txn, schema.Record(name, image, arrays, row, session, profile))
 
-    def add_record(self, name: str, record: schema.Record) -> int:
-        """Add an image as it lies in another map of the same model, and return its index.
+    def add_record(self, record: schema.Record, name: str) -> int:
+        """Add an image of another map of the same model under a name; return its index.
 
         Where the profiles differ, its descriptors are written as this map has them.
         """
@@ -119,14 +136,14 @@ class MapWriter:
             own, dim = self._metadata.profile, self._metadata.model.descriptor_dim
             record = schema.recode(record, dim, own)
             image = schema.rename_image(record.image, name)
-            return self._append(txn, name, replace(record, image=image))
+            return self._append(txn, replace(record, name=name, image=image))
 
-    def _append(self, txn: lmdb.Transaction, name: str, record: schema.Record) -> int:
-        if txn.get(schema.name_key(name)) is not None:
-            raise DatabaseError(f"holds an image {name!r} already")
+    def _append(self, txn: lmdb.Transaction, record: schema.Record) -> int:
+        if txn.get(schema.name_key(record.name)) is not None:
+            raise DatabaseError(f"holds an image {record.name!r} already")
         index = self._num_images
         row = record.row._replace(session=self._number_of(record.session))
-        _put(txn, schema.name_key(name), schema.encode_index(index))
+        _put(txn, schema.name_key(record.name), schema.encode_index(index))
         _put(txn, schema.image_key(index), record.image)
         _put(txn, schema.features_key(index), record.features)
         self._rows.append(row)
@@ -224,6 +241,33 @@ class MapWriter:
             _put(txn, schema.METADATA_KEY, metadata.encode())
             txn.commit()
             self._txn, self._metadata, self._has_removed = None, metadata, False
+            self._reach_last_page()
+
+    def _reach_last_page(self) -> None:
+        """Make the file as long as LMDB says: it does not write pages that it has given up again.
+
+        A file that is shorter counts as cut short.
+        """
+        assert self._environment is not None
+        pages = self._environment.info()["last_pgno"] + 1
+        size = pages * self._environment.stat()["psize"]
+        if os.fstat(self._fd).st_size < size:
+            os.ftruncate(self._fd, size)
+
+    def copy_to(self, path: Path) -> None:
+        """Write what was committed to a new file of the same owner and mode, without free pages."""
+        with reporting(self._path):
+            if self._environment is None:
+                raise DatabaseError("this writer is closed")
+            status = os.fstat(self._fd)
+            fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            try:
+                os.fchown(fd, status.st_uid, status.st_gid)
+                os.fchmod(fd, stat.S_IMODE(status.st_mode))
+                self._environment.copyfd(fd, compact=True)
+                os.fsync(fd)
+            finally:
+                os.close(fd)
 
     def close(self) -> None:
         """Drop what was not committed and let other writers in."""
@@ -270,6 +314,8 @@ class MapWriter:
 
 
 def _put(txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
+    # LMDB would leave a value that shrinks twice in one commit more pages than `verify` accepts.
+    txn.delete(key)
     txn.put(key, schema.seal(key, payload))
 
 
