@@ -97,8 +97,8 @@ class Responder:
 
     def _localize(self, request: Request) -> dict[str, Any]:
         (camera,) = _parse(request, "camera", optional=("position", "radius_m"))
-        frame = self._frame(request, camera, "request")
-        result = self._pipeline.localize(frame, _parse_prior(request.parameters))
+        prior = _parse_prior(request.parameters)
+        result = self._pipeline.localize(self._frame(request, camera, "request"), prior)
         return {**describe(result), "map_generation": self._pipeline.reader.generation}
 
     def _info(self, request: Request) -> dict[str, Any]:
