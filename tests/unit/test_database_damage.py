@@ -162,7 +162,7 @@ def test_damage_after_a_record_was_read_is_found_by_verify(tmp_path: Path) -> No
 
 
 def row(session: int = 0) -> schema.Row:
-    return schema.Row(np.float32(1), session, np.ones(32, np.int8))
+    return schema.Row(np.float32(1), np.zeros(3, np.float32), session, np.ones(32, np.int8))
 
 
 @pytest.mark.parametrize(
