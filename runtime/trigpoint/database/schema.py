@@ -56,7 +56,7 @@ from trigpoint.rigid import Rigid3
 
 Array32 = NDArray[np.float32]
 
-FORMAT = 3
+FORMAT = 4
 BLOCK_ROWS = 256
 MAX_NAME_BYTES = 500  # LMDB's keys end at 511
 MAX_KEYPOINTS = 65_535
