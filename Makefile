@@ -17,7 +17,7 @@ LIB = $(DESTDIR)$(PREFIX)/lib
 SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
 .PHONY: demo test kill-test test-oak test-systemd test-v4l2 check golden
-.PHONY: bench bench-building bench-models bench-localizer bench-daemon soak wheel-test clean
+.PHONY: bench bench-building bench-models bench-localizer bench-daemon bench-maps soak wheel-test clean
 .PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
@@ -113,6 +113,11 @@ soak: $(READY) $(DEMO)/map.tpmap
 
 $(DEMO)/map.tpmap: | $(READY)
 	$(BIN)/trigpoint-db demo $(DEMO)
+
+# Profiles of maps, and retrieval in maps of up to a million images; half an hour and 2 GB.
+bench-maps: $(READY)
+	@mkdir -p build/bench
+	$(BIN)/python -m benchmarks.maps $(DATA) --output build/bench/maps.md
 
 # The suite against the installed wheel, not the checkout.
 wheel-test: $(READY)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError, DatabaseError, ModelError
-from trigpoint.frame import Failed, Frame, Localized, Result, describe, summarize
+from trigpoint.frame import Failed, Frame, Localized, Prior, Result, describe, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import load_matcher
@@ -86,10 +86,10 @@ class Pipeline:
         }
         return Output(captured, result, pose, json.dumps(status).encode())
 
-    def localize(self, frame: Frame | BadFrame) -> Result | Failed:
+    def localize(self, frame: Frame | BadFrame, prior: Prior | None = None) -> Result | Failed:
         """Localize one frame in the map as it is now."""
         self._refresh_map()
-        return self._localize(frame)
+        return self._localize(frame, prior)
 
     def _refresh_map(self) -> None:
         """Take up what was added to the map; where that cannot be used, keep what there was."""
@@ -111,11 +111,11 @@ class Pipeline:
         except ConfigError as error:
             self._report(f"{error}; going on without it")
 
-    def _localize(self, frame: Frame | BadFrame) -> Result | Failed:
+    def _localize(self, frame: Frame | BadFrame, prior: Prior | None) -> Result | Failed:
         if isinstance(frame, BadFrame):
             return Failed(frame.reason, frame.detail)
         try:
-            return self.localizer.localize(frame)
+            return self.localizer.localize(frame, prior)
         # A damaged image of the map, a network that fails on this frame: others may do.
         except DatabaseError as error:
             return self._failed("BAD_MAP", str(error))

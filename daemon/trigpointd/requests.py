@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from trigpoint.camera import Camera
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import RequestError, TrigpointError
-from trigpoint.frame import Frame, describe
+from trigpoint.frame import Frame, Prior, describe
 from trigpoint.images import decode_gray, read_size
 from trigpoint.rigid import Rigid3
 from trigpointd.config import Config, RequestsConfig
@@ -96,8 +96,9 @@ class Responder:
         return self._map_actions[action](request)
 
     def _localize(self, request: Request) -> dict[str, Any]:
-        (camera,) = _parse(request, "camera")
-        result = self._pipeline.localize(self._frame(request, camera, "request"))
+        (camera,) = _parse(request, "camera", optional=("position", "radius_m"))
+        prior = _parse_prior(request.parameters)
+        result = self._pipeline.localize(self._frame(request, camera, "request"), prior)
         return {**describe(result), "map_generation": self._pipeline.reader.generation}
 
     def _info(self, request: Request) -> dict[str, Any]:
@@ -212,6 +213,19 @@ def _parse_pose(text: str) -> Rigid3:
     if not np.abs(t).max() < _MAX_COORDINATE:
         raise RequestError(f"cam_from_world is {text!r}; its translation is too far away")
     return Rigid3.from_quaternion(quaternion, t)
+
+
+def _parse_prior(parameters: Mapping[str, str]) -> Prior | None:
+    position, radius = (parameters.get(name) for name in ("position", "radius_m"))
+    if position is None and radius is None:
+        return None
+    try:
+        x, y, z = (float(number) for number in (position or "").split(","))
+        return Prior((x, y, z), float(radius or ""))
+    except ValueError:
+        raise RequestError(
+            f"position is {position!r} and radius_m {radius!r}; write both, 'x,y,z' and a number"
+        ) from None
 
 
 def _require_plausible(camera: Camera) -> None:

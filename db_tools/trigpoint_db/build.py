@@ -9,16 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from trigpoint.camera import Camera
+from trigpoint.database.codec import Profile
 from trigpoint.database.reader import MapReader
-from trigpoint.database.replacing import partial_map, resumable_map
+from trigpoint.database.replacing import COMMIT_EVERY, partial_map, resumable_map
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError
 from trigpoint.frame import Frame, LocalFeatures, Session
 from trigpoint.models.features import FeatureModel
 from trigpoint_db.extraction import Crew, EncodedImage, extract_by_workers, extract_features
 from trigpoint_db.importers.base import PosedImage
-
-COMMIT_EVERY = 100  # images of a new map; what a crash costs at the most
 
 
 def select_images(images: Sequence[PosedImage], names: Sequence[str]) -> list[PosedImage]:
@@ -73,14 +72,15 @@ def build_map(
     session: Session | None = None,
     crew: Crew | None = None,
     resume: bool = False,
+    profile: Profile | None = None,
 ) -> int:
     """Write a new map; it appears under its name when it is complete. Returns the image count.
 
     The images are read from `folder` by `read_frame`. The same images in the same order give the
     same bytes, whoever does the work. With `resume`, what an interrupted build of the same images
-    has committed is taken over; an interrupted one leaves the same records then.
+    and profile has committed is taken over; an interrupted one leaves the same records then.
     """
-    with resumable_map(path, model.identity, resume=resume) as writer:
+    with resumable_map(path, model.identity, profile, resume=resume) as writer:
         remaining = iter(images)
         if len(writer):
             _pass_over(remaining, partial_map(path), session)

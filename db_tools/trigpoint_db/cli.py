@@ -20,6 +20,7 @@ import typer
 from rich.table import Table
 
 from trigpoint.camera import Camera
+from trigpoint.database.codec import Profile
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError, SourceError, TrigpointError
 from trigpoint.frame import Failed, Localized, PoseNoise, describe, summarize
@@ -52,12 +53,20 @@ from trigpoint_db.importers.registry import read_dataset
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import localize_images
 from trigpoint_db.maps import count_sessions, leave_out
-from trigpoint_db.poses import Query, read_names, read_poses, read_queries, write_poses
+from trigpoint_db.poses import (
+    Query,
+    read_names,
+    read_poses,
+    read_priors,
+    read_queries,
+    write_poses,
+)
 from trigpoint_db.recording import FORMATS, RecordedImage, write_recording
 from trigpoint_db.recover import recover
 from trigpoint_db.terminal import (
     Json,
     MapPath,
+    MapProfile,
     Model,
     Retrieval,
     SessionDate,
@@ -132,6 +141,7 @@ def build(
     density: DensityText = None,
     density_angle: DensityAngle = 15.0,
     keypoints: Annotated[int, typer.Option(help="At most so many an image.", min=50)] = 1024,
+    profile: MapProfile = None,
     model: Model = "base",
     retrieval: Retrieval = None,
     as_json: Json = False,
@@ -159,11 +169,12 @@ def build(
         raise ConfigError(f"there are no images to map: {list_ or source} names none")
     check_output(map_)
     if append:
+        require_profile(map_, profile)
         posed = select_new(posed, map_, skip_existing=skip_existing)
     check_files((image.name for image in posed), dataset.images)
     if append and resume:
         raise ConfigError("an interrupted --append goes on with --append --skip-existing")
-    write = append_map if append else partial(build_map, resume=resume)
+    write = append_map if append else partial(build_map, resume=resume, profile=profile)
     network = FeatureModel.load(model, retrieval=retrieval)
     files = NetworkFiles(model, retrieval, network.identity)
     with (
@@ -211,6 +222,16 @@ def hint_at_resuming(*, append: bool) -> Iterator[None]:
         raise
 
 
+def require_profile(map_: Path, profile: Profile | None) -> None:
+    """Refuse to add to a map of another profile than was asked for."""
+    with MapReader.open(map_) as reader:
+        if profile not in (None, reader.profile):
+            raise ConfigError(
+                f"{map_} is of the {reader.profile} profile, and images added are of it too; "
+                "leave --profile out"
+            )
+
+
 @app.command()
 def calibrate(
     map_: MapPath, model: Model = "base", retrieval: Retrieval = None, as_json: Json = False
@@ -243,6 +264,9 @@ def localize(
     poses: Annotated[Path, typer.Option(help="Write `name qw qx qy qz tx ty tz`.")],
     results: Annotated[Path | None, typer.Option(help="Write a JSON line a query.")] = None,
     anchors: Annotated[int, typer.Option(help="How many to retrieve.", min=2)] = 20,
+    priors: Annotated[
+        Path | None, typer.Option(help="Lines `name x y z radius`: images elsewhere do not count.")
+    ] = None,
     model: Model = "base",
     retrieval: Retrieval = None,
     matcher: Annotated[
@@ -256,6 +280,9 @@ def localize(
     wanted = read_queries(queries)
     if not wanted:
         raise ConfigError(f"{queries} names no images")
+    around = {} if priors is None else read_priors(priors)
+    if priors is not None and not any(query.name in around for query in wanted):
+        raise ConfigError(f"{priors} names none of the images in {queries}")
     check_files((query.name for query in wanted), images)
     network = FeatureModel.load(model, retrieval=retrieval)
     matching = load_matcher(matcher, network.identity.descriptor_dim)
@@ -265,7 +292,7 @@ def localize(
             raise ConfigError(f"{map_} holds no images; add some: trigpoint-db build --append")
         lines = None if results is None else stack.enter_context(open_text(results))
         localizer = Localizer(network, reader, options, time.perf_counter, matching)
-        localized = localize_images(localizer, wanted, images)
+        localized = localize_images(localizer, wanted, images, around)
         outcomes = []
         for outcome in track(localized, "localizing", len(wanted)):
             outcomes.append(outcome)
@@ -332,6 +359,8 @@ def info(map_: MapPath, as_json: Json = False) -> None:
             "generation": reader.generation,
             "model": reader.model.name,
             "model_sha256": reader.model.sha256,
+            "profile": reader.profile,
+            "has_index": reader.has_index,
             "descriptor_dim": reader.model.descriptor_dim,
             "global_dim": reader.model.global_dim,
             "pose_noise": reader.pose_noise and asdict(reader.pose_noise),

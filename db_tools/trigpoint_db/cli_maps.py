@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from trigpoint.database.index import MIN_ROWS
 from trigpoint.database.reader import MapReader
 from trigpoint.database.replacing import compact_map
 from trigpoint.errors import ConfigError
@@ -34,6 +35,7 @@ from trigpoint_db.poses import read_names
 from trigpoint_db.terminal import (
     Json,
     MapPath,
+    MapProfile,
     Model,
     Retrieval,
     SessionDate,
@@ -112,10 +114,28 @@ def split(
 
 
 @app.command()
-def compact(map_: MapPath, as_json: Json = False) -> None:
-    """Give the space of removed images back: rewrite a map, under those that have it open."""
+def compact(
+    map_: MapPath,
+    profile: MapProfile = None,
+    index: Annotated[
+        bool | None,
+        typer.Option(
+            "--index/--no-index",
+            help=f"An index of the images; by default from {MIN_ROWS} on, or as it was.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Rewrite a map, under those that have it open: smaller, and faster to search.
+
+    The space of removed images is given back. With `--profile compact` an image takes a third of
+    the space, for good.
+    """
     before = map_.stat().st_size if map_.is_file() else 0
-    compact_map(map_)
+    compact_map(
+        map_, profile=profile, index=index, track=lambda part: track(part, "compacting", len(part))
+    )
     after = map_.stat().st_size
     if as_json:
         print(json.dumps({"map": str(map_), "bytes_before": before, "bytes": after}))

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from trigpoint.database.reader import MapReader
-from trigpoint.database.replacing import new_map, rewritten_map
+from trigpoint.database.replacing import COMMIT_EVERY, new_map, rewritten_map
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError
 from trigpoint.frame import Anchor, Session
 from trigpoint.rigid import rotation_angle
-from trigpoint_db.build import COMMIT_EVERY
 
 Track = Callable[[Sequence[int]], Iterable[int]]
 
@@ -60,8 +59,8 @@ def remove_images(path: Path, names: Iterable[str]) -> None:
 def merge_maps(a: Path, b: Path, out: Path, *, prefix: str = "", track: Track = iter) -> int:
     """Write the images of two maps of one model to a new one; returns how many.
 
-    `prefix` is put before the names of the second. How well the poses of both agree is not known:
-    see `calibrate_map`.
+    `prefix` is put before the names of the second. The new map has the first one's profile. How
+    well the poses of both agree is not known: see `calibrate_map`.
     """
     with MapReader.open(a) as first, MapReader.open(b, first.model) as second:
         common = set(first.names()) & {prefix + name for name in second.names()}
@@ -70,7 +69,7 @@ def merge_maps(a: Path, b: Path, out: Path, *, prefix: str = "", track: Track = 
                 f"{len(common)} names are in both maps, such as {min(common)!r}; put something "
                 "before those of the second with --prefix"
             )
-        with new_map(out, first.model) as writer:
+        with new_map(out, first.model, first.profile) as writer:
             _copy(first, writer, track(range(len(first))))
             _copy(second, writer, track(range(len(second))), prefix)
             return len(writer)
@@ -92,7 +91,7 @@ def split_map(path: Path, box: Sequence[float], out: Path, *, track: Track = ite
         if not inside.any():
             extent = f"from {centers.min(axis=0)} to {centers.max(axis=0)}"
             raise ConfigError(f"no camera of {path} is in the box; they are {extent}")
-        with new_map(out, reader.model) as writer:
+        with new_map(out, reader.model, reader.profile) as writer:
             _copy(reader, writer, track(np.flatnonzero(inside).tolist()))
             writer.set_pose_noise(reader.pose_noise)
             return len(writer)
@@ -100,7 +99,10 @@ def split_map(path: Path, box: Sequence[float], out: Path, *, track: Track = ite
 
 def copy_without(path: Path, names: Iterable[str], out: Path) -> int:
     """Write the images of a map, but for those named, to a new one; returns how many."""
-    with MapReader.open(path) as reader, new_map(out, reader.model) as writer:
+    with (
+        MapReader.open(path) as reader,
+        new_map(out, reader.model, reader.profile) as writer,
+    ):
         return _copy_without(reader, writer, names)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
+from trigpoint.frame import Prior
 from trigpoint.output import check_output
 from trigpoint.poses import format_pose
 from trigpoint.rigid import Rigid3
@@ -68,6 +69,17 @@ def write_queries(path: Path, queries: Iterable[Query]) -> None:
     queries = list(queries)
     _check_names(path, (query.name for query in queries))
     write_atomically(path, "".join(f"{q.name} {q.camera.to_text()}\n" for q in queries))
+
+
+def read_priors(path: Path) -> dict[str, Prior]:
+    """Read `name x y z radius` lines: where the camera of each query was about."""
+    priors: dict[str, Prior] = {}
+    for where, name, (x, y, z, radius) in read_rows(read_entries(path), "name x y z radius"):
+        try:
+            priors[name] = Prior((x, y, z), radius)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
+    return priors
 
 
 def write_poses(path: Path, poses: Mapping[str, Rigid3]) -> None:

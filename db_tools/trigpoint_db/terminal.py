@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from trigpoint.database.codec import Profile
 from trigpoint.errors import ConfigError
 from trigpoint.frame import Session
 
@@ -23,6 +24,10 @@ Retrieval = Annotated[
     Path | None, typer.Option(help="A retrieval network, where the other needs one beside it.")
 ]
 MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="A .tpmap file.")]
+MapProfile = Annotated[
+    Profile | None,
+    typer.Option("--profile", help="standard, or compact: a third of the size, less precise."),
+]
 SessionName = Annotated[
     str | None, typer.Option("--session", help="What survey the images are of, a name.")
 ]

@@ -125,6 +125,36 @@ class Session:
         return self.name if self.date is None else f"{self.name} ({self.date})"
 
 
+@dataclass(frozen=True)
+class Prior:
+    """Where a camera is about, by GPS or its last pose: a ball in the map's frame.
+
+    Parameters
+    ----------
+    center : (float, float, float)
+        In the map's unit.
+    radius : float
+        The same; large enough for the camera and for the images that see what it sees.
+    """
+
+    center: tuple[float, float, float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.center).all() and 0 < self.radius < np.inf):
+            raise ConfigError(
+                f"a prior position is three numbers and a radius above 0, not {self.center} and "
+                f"{self.radius}"
+            )
+
+    def contains(self, centers: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Say which centers (N, 3) are inside."""
+        inside: NDArray[np.bool_] = (
+            np.linalg.norm(centers - np.array(self.center), axis=1) <= self.radius
+        )
+        return inside
+
+
 @dataclass(frozen=True, eq=False)
 class Anchor:
     """A reference image of the map, with its known pose."""

@@ -17,7 +17,16 @@ import numpy as np
 
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError
-from trigpoint.frame import Frame, LocalFeatures, Localized, Lost, Reason, Result, Statistics
+from trigpoint.frame import (
+    Frame,
+    LocalFeatures,
+    Localized,
+    Lost,
+    Prior,
+    Reason,
+    Result,
+    Statistics,
+)
 from trigpoint.geometry.joint_refinement import RefinedPose
 from trigpoint.geometry.triangulation import LatentPoints
 from trigpoint.models.features import FeatureModel
@@ -116,13 +125,15 @@ class Localizer:
                         f"it has {', '.join(sorted(known)) or 'none'}"
                     )
 
-    def localize(self, frame: Frame) -> Result:
+    def localize(self, frame: Frame, prior: Prior | None = None) -> Result:
         """Estimate cam_from_world of a frame, with covariance, or say why not.
 
+        With a prior position, images from elsewhere are not tried first; they still count against a
+        pose that they would explain as well, so that a wrong prior makes no wrong pose.
         With `try_turned`, a frame that is lost as it is is also tried on its sides and upside down.
         """
         deadline = _Deadline(self.clock, self.options.max_latency_ms)
-        result = self._localize(frame, Statistics(), deadline)
+        result = self._localize(frame, prior, Statistics(), deadline)
         if isinstance(result, Localized) or not self.options.try_turned:
             return result
         if result.reason in (Reason.NO_MAP, Reason.TOO_DARK, Reason.FEW_FEATURES):
@@ -131,7 +142,7 @@ class Localizer:
             if deadline.is_over():
                 break
             start = Statistics(turned_deg=turned_deg, stage_ms=result.statistics.stage_ms)
-            turned = self._localize(frame, start, deadline)
+            turned = self._localize(frame, prior, start, deadline)
             if isinstance(turned, Localized):
                 return turned
         return result
@@ -140,7 +151,9 @@ class Localizer:
         """Solve for the pose with the anchors that a query is matched with, all at once."""
         return self._solve(query, True, _Trace(self.clock, Statistics()))
 
-    def _localize(self, frame: Frame, statistics: Statistics, deadline: _Deadline) -> Result:
+    def _localize(
+        self, frame: Frame, prior: Prior | None, statistics: Statistics, deadline: _Deadline
+    ) -> Result:
         options, trace = self.options, _Trace(self.clock, statistics)
         if len(self.reader) == 0:
             return trace.lost(Reason.NO_MAP, "the map holds no image")
@@ -162,6 +175,7 @@ class Localizer:
                 options.anchor_diversity,
                 prefer=options.prefer_sessions,
                 exclude=options.exclude_sessions,
+                prior=prior,
             )
         if len(indices) < 2:
             detail = f"the map holds {len(indices) or 'no'} image that may be used"

@@ -124,6 +124,33 @@ def test_an_image_of_the_map_is_found_where_it_was_taken(
     assert np.linalg.eigvalsh(result["covariance"])[0] > 0
 
 
+def test_an_image_is_looked_for_around_a_position(
+    ask: Asker, demo: Demo, survey: list[PosedImage]
+) -> None:
+    image = survey[5]
+    x, y, z = image.cam_from_world.center
+    query = "localize", files(demo, image), "image/jpeg"
+    found = ask(*query, camera="phone", position=f"{x},{y},{z}", radius_m="2")
+    assert found["status"] == "LOCALIZED"
+    elsewhere = ask(*query, camera="phone", position=f"{x + 100},{y},{z}", radius_m="2")
+    assert (elsewhere["status"], elsewhere["reason"]) == ("LOST", "FEW_ANCHORS")
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        {"position": "1,2,3"},
+        {"radius_m": "5"},
+        {"position": "1,2", "radius_m": "5"},
+        {"position": "1,2,z", "radius_m": "5"},
+        {"position": "1,2,3", "radius_m": "far"},
+    ],
+)
+def test_a_position_that_cannot_be_read_is_an_error(ask: Asker, prior: dict[str, str]) -> None:
+    said = ask.error("localize", b"", "image/jpeg", camera="phone", **prior)
+    assert "write both, 'x,y,z' and a number" in said
+
+
 def test_an_image_that_is_not_found_is_an_answer_with_the_reason(ask: Asker) -> None:
     dark = cv2.imencode(".png", np.zeros((480, 640), np.uint8))[1].tobytes()
     result = ask("localize", dark, "image/png", camera="phone")

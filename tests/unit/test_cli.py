@@ -228,3 +228,44 @@ def test_nothing_is_sent_home(demo: Demo, tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.stderr == b""
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_compact_map_is_built_and_added_to(run: Run, place: Path) -> None:
+    names = [image.name for image in read_model(place / "sparse")]
+    for path, part in (("first.txt", names[:8]), ("others.txt", names[8:])):
+        (place / path).write_text("\n".join(part))
+    first = build(place, "m.tpmap", "--list", place / "first.txt", "--profile", "compact")
+    assert run(*first)[0] == 0
+    more = build(place, "m.tpmap", "--list", place / "others.txt", "--append")
+    code, _, err = run(*more, "--profile", "standard")
+    assert code == 1
+    assert "is of the compact profile" in err
+    assert run(*more)[0] == 0
+    facts = json.loads(run("info", place / "m.tpmap", "--json")[1])
+    assert (facts["profile"], facts["num_images"]) == ("compact", 12)
+    assert facts["bytes"] < 12 * 30_000
+
+
+def test_queries_are_localized_around_prior_positions(run: Run, place: Path) -> None:
+    assert run(*build(place))[0] == 0
+    images = read_model(place / "sparse")[:2]
+    centers = [
+        image.cam_from_world.center + offset for image, offset in zip(images, (0, 500), strict=True)
+    ]
+    lines = [f"{i.name} {x} {y} {z} 5\n" for i, (x, y, z) in zip(images, centers, strict=True)]
+    (place / "priors.txt").write_text("".join(lines))
+    arguments = [
+        "localize", place / "m.tpmap", "--images", place / "images",
+        "--queries", place / "queries.txt", "--poses", place / "poses.txt", "--json",
+    ]  # fmt: skip
+    code, out, _ = run(*arguments, "--priors", place / "priors.txt")
+    assert code == 0
+    assert json.loads(out)["outcomes"] == {"LOCALIZED": 2, "FEW_ANCHORS": 1}
+    assert list(read_poses(place / "poses.txt")) == [
+        images[0].name,
+        read_model(place / "sparse")[2].name,
+    ]
+    (place / "priors.txt").write_text("other.jpg 0 0 0 1\n")
+    code, _, err = run(*arguments, "--priors", place / "priors.txt")
+    assert code == 1
+    assert "names none of the images" in err

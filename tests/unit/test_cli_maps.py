@@ -125,6 +125,19 @@ def test_a_map_is_compacted_in_place(run: Run, map_: Path) -> None:
     assert "no such map" in err
 
 
+def test_a_map_is_made_compact_and_gets_an_index(run: Run, map_: Path) -> None:
+    assert run("compact", map_, "--profile", "compact", "--index")[0] == 0
+    facts = json.loads(run("info", map_, "--json")[1])
+    assert (facts["profile"], facts["has_index"]) == ("compact", True)
+    assert run("compact", map_, "--no-index")[0] == 0
+    facts = json.loads(run("info", map_, "--json")[1])
+    assert (facts["profile"], facts["has_index"]) == ("compact", False)
+    assert len(names(map_)) == 6
+    code, _, err = run("compact", map_, "--profile", "standard")
+    assert code == 1
+    assert "does not come back; rebuild it" in err
+
+
 def status(outcome: str, **inliers: int) -> dict[str, object]:
     """What a daemon says of a frame that was matched with some images of the map."""
     anchors = [f"folder/{name[1:]}.png" for name in inliers]

@@ -107,7 +107,7 @@ def test_a_map_of_another_model_is_refused_and_both_are_named(tmp_path: Path) ->
 def test_a_map_of_another_format_is_refused(tmp_path: Path) -> None:
     path = make_map(tmp_path / "a.tpmap", 1)
     alter_entry(path, schema.METADATA_KEY, b'{"format": 9, "shards": []}')
-    with pytest.raises(DatabaseError, match="a map of format 9, and this version reads format 3"):
+    with pytest.raises(DatabaseError, match="a map of format 9, and this version reads format 4"):
         MapReader.open(path)
 
 
@@ -162,7 +162,7 @@ def test_damage_after_a_record_was_read_is_found_by_verify(tmp_path: Path) -> No
 
 
 def row(session: int = 0) -> schema.Row:
-    return schema.Row(np.float32(1), session, np.ones(32, np.int8))
+    return schema.Row(np.float32(1), np.zeros(3, np.float32), session, np.ones(32, np.int8))
 
 
 @pytest.mark.parametrize(

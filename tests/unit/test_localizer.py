@@ -19,7 +19,7 @@ from trigpoint.database.reader import MapReader
 from trigpoint.database.replacing import new_map
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError
-from trigpoint.frame import Frame, Localized, Lost, Reason, Session, describe
+from trigpoint.frame import Frame, Localized, Lost, Prior, Reason, Session, describe
 from trigpoint.images import read_gray
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
@@ -321,3 +321,51 @@ def test_a_camera_on_its_side_is_found_where_asked_for(
     assert np.linalg.norm(result.cam_from_world.center - truth.center) < 0.02
     R = turn @ truth.R
     assert np.degrees(rotation_angle(result.cam_from_world.R @ R.T)) < 0.3
+
+
+def test_a_prior_position_leaves_out_anchors_from_elsewhere(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    centers = {name: reader.view(i)[1].center for i, name in enumerate(reader.names())}
+    frame, truth = flight[0]
+    prior = Prior(tuple(truth.center), 1.5)
+    result = Localizer(model, reader).localize(frame, prior)
+    assert isinstance(result, Localized), describe(result)
+    assert np.linalg.norm(result.cam_from_world.center - truth.center) < 0.02
+    distances = [np.linalg.norm(centers[a] - truth.center) for a in result.statistics.anchors]
+    assert max(distances) <= 1.5
+    assert sum(np.linalg.norm(c - truth.center) > 1.5 for c in centers.values()) > 10
+
+
+def test_a_wrong_prior_position_makes_no_wrong_pose(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    localizer = Localizer(model, reader)
+    centers = [reader.view(index)[1].center for index in range(0, len(reader), 20)]
+    for frame, truth in flight:
+        for center in centers:
+            result = localizer.localize(frame, Prior(tuple(center), 1.0))
+            if isinstance(result, Localized):
+                assert np.linalg.norm(result.cam_from_world.center - truth.center) < 0.05
+    nowhere = localizer.localize(flight[0][0], Prior((500.0, 0.0, 0.0), 1.0))
+    assert isinstance(nowhere, Lost)
+    assert nowhere.reason == Reason.FEW_ANCHORS
+    assert "no image that may be used" in nowhere.detail
+
+
+def test_a_prior_position_does_not_decide_between_two_rooms_that_are_the_same(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]], tmp_path: Path
+) -> None:
+    next_door = np.array([60.0, 0.0, 0.0])
+    path = tmp_path / "twice.tpmap"
+    with MapWriter.create(path, model.identity) as writer:
+        for offset in (np.zeros(3), next_door):
+            for index in range(len(reader)):
+                camera, pose = reader.view(index)
+                moved = Rigid3.from_center(pose.R, pose.center + offset)
+                writer.add(f"{index} {offset[0]}", camera, moved, reader.features(index))
+    with MapReader.open(path, model.identity) as twice:
+        for offset in (np.zeros(3), next_door):
+            frame, truth = flight[0]
+            prior = Prior(tuple(truth.center + offset), 20.0)
+            assert isinstance(Localizer(model, twice).localize(frame, prior), Lost)

@@ -15,9 +15,10 @@ from tests.unit.conftest import Run
 from tests.unit.labor import die_of_seven, die_once, square
 from tests.unit.surveys import make_survey
 from trigpoint.database.reader import MapReader
+from trigpoint.database.replacing import COMMIT_EVERY
 from trigpoint.errors import ConfigError, DatabaseError, SourceError
 from trigpoint.models.features import FeatureModel
-from trigpoint_db.build import COMMIT_EVERY, build_map
+from trigpoint_db.build import build_map
 from trigpoint_db.extraction import Crew, NetworkFiles
 from trigpoint_db.importers.base import PosedImage
 from trigpoint_db.importers.colmap import read_model

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
 from trigpoint.database import schema
+from trigpoint.database.codec import Profile
 from trigpoint.database.pages import DamageError
-from trigpoint.database.ranking import POOL, PREFERENCE, choose_diverse, find_largest
+from trigpoint.database.ranking import POOL, PREFERENCE, choose_diverse
+from trigpoint.database.retrieval import Retrieval
 from trigpoint.database.snapshot import OVERWRITTEN, LockFileError, Snapshot, reporting
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import (
@@ -21,6 +23,7 @@ from trigpoint.frame import (
     LocalFeatures,
     ModelIdentity,
     PoseNoise,
+    Prior,
     Session,
     restore_descriptors,
 )
@@ -38,9 +41,12 @@ class MapReader:
 
     def __init__(self, path: Path, snapshot: Snapshot) -> None:
         self._path = path
-        self._snapshot: Snapshot | None = snapshot
-        self._metadata, self._file = snapshot.metadata, snapshot.file
         self._is_closed = False
+        self._take(snapshot)
+
+    def _take(self, snapshot: Snapshot) -> None:
+        self._retrieval: Retrieval | None = Retrieval(snapshot)
+        self._metadata, self._file = snapshot.metadata, snapshot.file
 
     @classmethod
     def open(cls, path: Path, model: ModelIdentity | None = None) -> Self:
@@ -49,15 +55,15 @@ class MapReader:
             return cls(path, Snapshot(path, model))
 
     @property
-    def _current(self) -> Snapshot:
-        if self._snapshot is None:
+    def _rows(self) -> Retrieval:
+        if self._retrieval is None:
             why = "this reader is closed" if self._is_closed else OVERWRITTEN
             raise DatabaseError(f"{self._path}: {why}")
-        return self._snapshot
+        return self._retrieval
 
     @contextmanager
     def _reading(self) -> Iterator[Snapshot]:
-        snapshot = self._current
+        snapshot = self._rows.snapshot
         with reporting(self._path):
             try:
                 yield snapshot
@@ -84,6 +90,16 @@ class MapReader:
         """The surveys that images of the map are of, or were."""
         return self._metadata.sessions
 
+    @property
+    def profile(self) -> Profile:
+        """What it spends on an image."""
+        return self._metadata.profile
+
+    @property
+    def has_index(self) -> bool:
+        """Whether `search` compares with some of the images only."""
+        return self._metadata.index is not None
+
     def __len__(self) -> int:
         return self._metadata.num_images
 
@@ -96,8 +112,8 @@ class MapReader:
     def sessions_by_index(self) -> list[Session | None]:
         """Return the session of each image, by index."""
         table = (None, *self.sessions)
-        with self._reading() as snapshot:
-            return [table[i] for b in _blocks(snapshot) for i in b.sessions.tolist()]
+        with self._reading():
+            return [table[i] for b in self._rows.blocks() for i in b.sessions.tolist()]
 
     def view(self, index: int) -> tuple[Camera, Rigid3]:
         """Return the camera of an image and its pose, cam_from_world."""
@@ -109,8 +125,9 @@ class MapReader:
         """Return an image with its features."""
         with self._reading() as snapshot:
             image = _image(snapshot, index)
+            payload = snapshot.get(schema.features_key(index))
             keypoints, descriptors = schema.decode_features(
-                image, snapshot.get(schema.features_key(index)), self.model.descriptor_dim
+                image, payload, self.model.descriptor_dim, self.profile
             )
         return Anchor(image.name, image.camera, image.cam_from_world, keypoints, descriptors)
 
@@ -119,7 +136,7 @@ class MapReader:
         with self._reading() as snapshot:
             _require_index(snapshot, index)
             block, place = divmod(index, schema.BLOCK_ROWS)
-            row = _block(snapshot, block).row(place)
+            row = self._rows.block(block).row(place)
             image = bytes(snapshot.get(schema.image_key(index)))
             return schema.Record(
                 schema.decode_name(memoryview(image)),
@@ -127,13 +144,14 @@ class MapReader:
                 bytes(snapshot.get(schema.features_key(index))),
                 row,
                 (None, *self.sessions)[row.session],
+                self.profile,
             )
 
     def features(self, index: int) -> LocalFeatures:
         """Return an image's features as if it were a query; its scores are not in the map."""
         anchor = self.anchor(index)
-        with self._reading() as snapshot:
-            (described,) = _descriptors(snapshot, np.array([index]))
+        with self._reading():
+            (described,) = self._rows.descriptors(np.array([index]))
         scores = np.zeros(len(anchor.keypoints), np.float32)
         descriptors = restore_descriptors(anchor.descriptors)
         return LocalFeatures(anchor.keypoints, descriptors, scores, described)
@@ -146,8 +164,11 @@ class MapReader:
         *,
         prefer: Collection[str] = (),
         exclude: Collection[str] = (),
+        prior: Prior | None = None,
     ) -> tuple[NDArray[np.intp], Array32]:
-        """Find the images that look most alike, by comparing with all.
+        """Find the images that look most alike.
+
+        Without an index by comparing with all; with one most of these are found.
 
         Where many images show the same view, and look like the query by accident, they would leave
         no place for the one that is right: `choose_diverse` prefers others.
@@ -164,6 +185,8 @@ class MapReader:
             Names of sessions: images of the former come as if their cosine were larger by
             `PREFERENCE`, those of the latter not at all. Names that the map does not have are of
             no effect.
+        prior : Prior, optional
+            Images whose cameras were elsewhere do not come.
 
         Returns
         -------
@@ -180,21 +203,14 @@ class MapReader:
                 f"its global descriptors are ({dim},), all finite"
             )
         bonus = _bonus(self.sessions, prefer, exclude)
-        similarities = np.empty(len(self), np.float32)
-        scores = similarities if bonus is None else np.empty_like(similarities)
-        with self._reading() as snapshot:
-            for i, block in enumerate(_blocks(snapshot)):
-                part = slice(schema.BLOCK_ROWS * i, schema.BLOCK_ROWS * (i + 1))
-                rows = block.numbers.astype(np.float32)
-                np.multiply(rows @ global_descriptor, block.scales, out=similarities[part])
-                if bonus is not None:
-                    np.add(similarities[part], bonus[block.sessions], out=scores[part])
-            best = find_largest(scores, k if diversity == 0 else POOL * k)
-            best = best[scores[best] > -np.inf]
+        num = k if diversity == 0 else POOL * k
+        with self._reading():
+            found = self._rows.search(global_descriptor, num, bonus, prior)
             if diversity > 0:
-                alike = _descriptors(snapshot, best)
-                best = best[choose_diverse(scores[best], alike @ alike.T, k, diversity)]
-        return best, similarities[best]
+                alike = self._rows.descriptors(found.indices)
+                chosen = choose_diverse(found.scores, alike @ alike.T, k, diversity)
+                return found.indices[chosen], found.similarities[chosen]
+        return found.indices, found.similarities
 
     def copy_to(self, fd: int) -> None:
         """Write the snapshot to an empty file, as a map of its own.
@@ -213,14 +229,14 @@ class MapReader:
             raise DatabaseError(f"{self._path}: this reader is closed")
         before = self._file, self._metadata
         with reporting(self._path):
-            if self._snapshot is not None and self._snapshot.is_newest(self._path):
+            if self._retrieval and self._retrieval.snapshot.is_newest(self._path):
                 return False
             new = self._open_newest()
-        if self._snapshot is not None and new.state == self._snapshot.state:
+        if self._retrieval and new.state == self._retrieval.snapshot.state:
             new.close()
         else:
             self._let_go()
-            self._snapshot, self._metadata, self._file = new, new.metadata, new.file
+            self._take(new)
         return (self._file, self._metadata) != before
 
     def _open_newest(self) -> Snapshot:
@@ -248,7 +264,7 @@ class MapReader:
     def verify(self) -> list[str]:
         """Check everything, whether checked before or not, and list what is wrong."""
         problems: list[str] = []
-        num_blocks = -(-len(self) // schema.BLOCK_ROWS)
+        rows = self._rows
         with self._reading() as snapshot:
             snapshot.forget_checks()
             for index in range(len(self)):
@@ -257,10 +273,15 @@ class MapReader:
                     snapshot.get(schema.features_key(index))
                     if schema.decode_index(snapshot.get(schema.name_key(name))) != index:
                         problems.append(f"the name {name!r} does not lead to image {index}")
-            for block in range(num_blocks):
+            for block in range(rows.num_blocks):
                 with _collecting(problems):
-                    _block(snapshot, block)
-            found, wanted = snapshot.count_entries(), 1 + 3 * len(self) + num_blocks
+                    rows.block(block)
+            wanted = 1 + 3 * len(self) + rows.num_blocks
+            if (inverted := snapshot.metadata.index) is not None:
+                wanted += 1 + inverted.num_lists
+                with _collecting(problems):
+                    rows.check_index(inverted)
+            found = snapshot.count_entries()
             if found != wanted:
                 problems.append(f"there are {found} entries where {wanted} belong")
         return list(dict.fromkeys(problems))  # a page is met more than once
@@ -271,9 +292,9 @@ class MapReader:
         self._is_closed = True
 
     def _let_go(self) -> None:
-        if self._snapshot is not None:
-            self._snapshot.close()
-        self._snapshot = None
+        if self._retrieval is not None:
+            self._retrieval.snapshot.close()
+        self._retrieval = None
 
     def __enter__(self) -> Self:
         return self
@@ -300,42 +321,12 @@ def _image(snapshot: Snapshot, index: int) -> schema.Image:
     return schema.decode_image(snapshot.get(schema.image_key(index)))
 
 
-def _blocks(snapshot: Snapshot) -> Iterator[schema.Block]:
-    return (
-        _block(snapshot, i) for i in range(-(-snapshot.metadata.num_images // schema.BLOCK_ROWS))
-    )
-
-
-def _block(snapshot: Snapshot, number: int) -> schema.Block:
-    metadata = snapshot.metadata
-    payload = snapshot.get(schema.block_key(number))
-    block = schema.decode_block(payload, metadata.model.global_dim)
-    wanted = min(metadata.num_images - number * schema.BLOCK_ROWS, schema.BLOCK_ROWS)
-    if len(block.numbers) != wanted:
-        raise DamageError(f"retrieval block {number} has {len(block.numbers)} rows, not {wanted}")
-    if block.sessions.max() > len(metadata.sessions):
-        raise DamageError(f"retrieval block {number} has images of an unknown session")
-    return block
-
-
 def _bonus(
     sessions: tuple[Session, ...], prefer: Collection[str], exclude: Collection[str]
-) -> Array32 | None:
-    """Return what each session, from none on, adds to a similarity; None if that is nothing."""
+) -> Array32:
+    """Return what each session, from none on, adds to a similarity (S + 1,)."""
     bonus = [0.0] + [
         -np.inf if session.name in exclude else PREFERENCE * (session.name in prefer)
         for session in sessions
     ]
-    return np.array(bonus, np.float32) if any(bonus) else None
-
-
-def _descriptors(snapshot: Snapshot, indices: NDArray[np.intp]) -> Array32:
-    """Return the global descriptors of some images (K, G)."""
-    descriptors = np.empty((len(indices), snapshot.metadata.model.global_dim), np.float32)
-    block_of = indices // schema.BLOCK_ROWS
-    for block in np.unique(block_of):
-        rows = _block(snapshot, int(block))
-        here = block_of == block
-        inside = indices[here] % schema.BLOCK_ROWS
-        descriptors[here] = rows.numbers[inside] * rows.scales[inside, None]
-    return descriptors
+    return np.array(bonus, np.float32)

@@ -6,16 +6,19 @@ neither an altered byte nor a value under a wrong key goes unnoticed.
 
     key                        value after the CRC
     00                         metadata, JSON
+    00 01                      centroids of the index, where there is one: (L, G) f2
+    00 02 list u32             a list of it: indices (n,) u4, then as a block
     01 name                    index of the image, u32
-    02 block u32               up to 256 retrieval rows: scales (n,) f4, sessions (n,) u2,
-                               numbers (n, G) i1
+    02 block u32               up to 256 retrieval rows: scales (n,) f4, camera centers (n, 3) f4,
+                               sessions (n,) u2, numbers (n, G) i1
     03 index u32 00            an image: pose, camera, sizes, its first keypoints, name
-    03 index u32 01            its features: other keypoints (N - j, 2) u2, descriptors (N, D) i1
+    03 index u32 01            its features: other keypoints (N - j, 2) u2, descriptors
 
 Keypoints are fixed point, `x = u step - 0.5` with `step = max(width, height) / 65535` px.
-Descriptors are `i 4 / (127 sqrt(D))`: numbers of a unit vector have a standard deviation of
-1 / sqrt(D). Retrieval rows have a scale each, which makes the stored row a unit vector. Their
-sessions are places in the metadata's list, from 1 on; 0 is no session.
+Descriptors are (N, D) i1, `i 4 / (127 sqrt(D))`: numbers of a unit vector have a standard deviation
+of 1 / sqrt(D); those of a compact map are as `codec` makes them. Retrieval rows have a scale each,
+which makes the stored row a unit vector. Their sessions are places in the metadata's list, from 1
+on; 0 is no session.
 """
 
 from __future__ import annotations
@@ -27,12 +30,19 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trigpoint.camera import PARAMETERS, Camera
+from trigpoint.database.codec import (
+    Profile,
+    decode_descriptors,
+    descriptor_bytes,
+    encode_descriptors,
+)
 from trigpoint.database.pages import HEADER_BYTES, DamageError
 from trigpoint.errors import ConfigError, DatabaseError
 from trigpoint.frame import (
@@ -40,13 +50,13 @@ from trigpoint.frame import (
     ModelIdentity,
     PoseNoise,
     Session,
-    quantize_descriptors,
+    restore_descriptors,
 )
 from trigpoint.rigid import Rigid3
 
 Array32 = NDArray[np.float32]
 
-FORMAT = 3
+FORMAT = 4
 BLOCK_ROWS = 256
 MAX_NAME_BYTES = 500  # LMDB's keys end at 511
 MAX_KEYPOINTS = 65_535
@@ -55,11 +65,18 @@ MAX_SESSIONS = 65_535
 NO_SESSION = 0
 
 METADATA_KEY = b"\x00"
+CENTROIDS_KEY = b"\x00\x01"
 _CRC = struct.Struct("<I")
 _INDEX = struct.Struct("<I")
 # Quaternion and t, parameters, model; width, height, keypoints; how many of these lie here.
 _IMAGE = struct.Struct(f"<7d {MAX_CAMERA_PARAMETERS}d 24s III H")
+_NUM_INLINE = struct.Struct("<H")  # its end
 _MAX_INLINE_BYTES = 1024
+
+
+def list_key(number: int) -> bytes:
+    """Key of a list of the index."""
+    return struct.pack(">BBI", 0, 2, number)
 
 
 def name_key(name: str) -> bytes:
@@ -86,6 +103,10 @@ def describe_key(key: bytes) -> str:
     """Say for people what lies under a key."""
     if key == METADATA_KEY:
         return "the map's metadata"
+    if key == CENTROIDS_KEY:
+        return "the centroids of the index"
+    if key[0] == 0:
+        return f"list {int.from_bytes(key[2:], 'big')} of the index"
     if key[0] == 1:
         return f"the index entry of {key[1:].decode()!r}"
     number = int.from_bytes(key[1:5], "big")
@@ -108,6 +129,15 @@ def unseal(key: bytes, value: memoryview | None, *, check: bool = True) -> memor
 
 
 @dataclass(frozen=True)
+class InvertedFile:
+    """An index of the first rows of a map, as they were when it was made."""
+
+    num_rows: int
+    num_lists: int
+    moved: tuple[int, ...] = ()  # rows of these that others have taken the place of since
+
+
+@dataclass(frozen=True)
 class Metadata:
     """What a map says of itself."""
 
@@ -116,6 +146,8 @@ class Metadata:
     num_images: int = 0
     pose_noise: PoseNoise | None = None  # as measured
     sessions: tuple[Session, ...] = ()
+    profile: Profile = Profile.STANDARD
+    index: InvertedFile | None = None
 
     def encode(self) -> bytes:
         """Write JSON."""
@@ -131,7 +163,10 @@ class Metadata:
                 f"a map of format {found}, and this version reads format {FORMAT}; "
                 "rebuild it with `trigpoint-db build` or use the version that made it"
             )
-        noise, sessions = fields["pose_noise"], fields["sessions"]
+        noise, sessions, index = (fields[key] for key in ("pose_noise", "sessions", "index"))
+        profile = fields["profile"]
+        if profile not in list(Profile):
+            raise DatabaseError(f"a map of profile {profile!r}; use the version that made it")
         return cls(
             **fields
             | {
@@ -141,6 +176,9 @@ class Metadata:
                     Session(s["name"], s["date"] and date.fromisoformat(s["date"]))
                     for s in sessions
                 ),
+                "profile": Profile(profile),
+                "index": index
+                and InvertedFile(index["num_rows"], index["num_lists"], tuple(index["moved"])),
             }
         )
 
@@ -154,6 +192,7 @@ class Record:
     features: bytes
     row: Row
     session: Session | None
+    profile: Profile  # of its descriptors
 
 
 def encode_index(index: int) -> bytes:
@@ -179,22 +218,15 @@ class Image:
 
 
 def encode_image(
-    name: str, camera: Camera, cam_from_world: Rigid3, features: LocalFeatures
+    name: str,
+    camera: Camera,
+    cam_from_world: Rigid3,
+    features: LocalFeatures,
+    profile: Profile = Profile.STANDARD,
 ) -> tuple[bytes, bytes]:
-    """Write an image and its features.
-
-    LMDB gives a large value whole pages. Where the features would hang over their last page but a
-    little (1024 x 64 are 17 pages and 20 bytes), the first keypoints go to the image instead, which
-    lies in the tree's own pages.
-    """
-    num_keypoints = len(features)
+    """Write an image and its features."""
     step = _keypoint_step_px(camera)
     keypoints = np.rint((features.keypoints.astype(np.float64) + 0.5) / step).astype("<u2")
-    descriptors = quantize_descriptors(features.descriptors)
-
-    stored = HEADER_BYTES + _CRC.size + keypoints.nbytes + descriptors.nbytes
-    overhang = stored % 4096 if stored > 4096 else 0
-    num_inline = -(-overhang // 4) if overhang <= min(_MAX_INLINE_BYTES, keypoints.nbytes) else 0
     header = _IMAGE.pack(
         *cam_from_world.quaternion,
         *cam_from_world.t,
@@ -202,13 +234,41 @@ def encode_image(
         camera.model.encode(),
         camera.width,
         camera.height,
-        num_keypoints,
-        num_inline,
+        len(features),
+        0,
     )
+    return _divide(header, name, keypoints, encode_descriptors(features.descriptors, profile))
+
+
+def _divide(
+    header: bytes, name: str, keypoints: NDArray[np.uint16], descriptors: bytes
+) -> tuple[bytes, bytes]:
+    """Put the keypoints (N, 2) where they take the least space.
+
+    LMDB gives a large value whole pages. Where the features would hang over their last page but a
+    little (1024 x 64 are 17 pages and 20 bytes), the first keypoints go to the image instead, which
+    lies in the tree's own pages.
+    """
+    stored = HEADER_BYTES + _CRC.size + keypoints.nbytes + len(descriptors)
+    overhang = stored % 4096 if stored > 4096 else 0
+    num_inline = -(-overhang // 4) if overhang <= min(_MAX_INLINE_BYTES, keypoints.nbytes) else 0
+    header = header[: -_NUM_INLINE.size] + _NUM_INLINE.pack(num_inline)
     return (
         header + keypoints[:num_inline].tobytes() + name.encode(),
-        keypoints[num_inline:].tobytes() + descriptors.tobytes(),
+        keypoints[num_inline:].tobytes() + descriptors,
     )
+
+
+def recode(record: Record, dim: int, profile: Profile) -> Record:
+    """Write an image with descriptors of `dim` numbers as a map of another profile has it."""
+    if record.profile == profile:
+        return record
+    image = decode_image(memoryview(record.image))
+    keypoints, descriptors = _split(image, memoryview(record.features), dim, record.profile)
+    numbers = restore_descriptors(decode_descriptors(descriptors, dim, record.profile))
+    header, encoded = record.image[: _IMAGE.size], encode_descriptors(numbers, profile)
+    written, features = _divide(header, image.name, keypoints, encoded)
+    return dataclasses.replace(record, image=written, features=features, profile=profile)
 
 
 def decode_name(payload: memoryview) -> str:
@@ -243,17 +303,23 @@ def decode_image(payload: memoryview) -> Image:
 
 
 def decode_features(
-    image: Image, payload: memoryview, dim: int
+    image: Image, payload: memoryview, dim: int, profile: Profile = Profile.STANDARD
 ) -> tuple[Array32, NDArray[np.int8]]:
     """Read keypoints (N, 2) in px and quantized descriptors (N, D)."""
+    fixed, descriptors = _split(image, payload, dim, profile)
+    keypoints = (fixed * _keypoint_step_px(image.camera) - 0.5).astype(np.float32)
+    return keypoints, decode_descriptors(descriptors, dim, profile)
+
+
+def _split(
+    image: Image, payload: memoryview, dim: int, profile: Profile
+) -> tuple[NDArray[np.uint16], memoryview]:
+    """Return an image's keypoints (N, 2), fixed point, and its descriptors as they lie."""
     split = 4 * (image.num_keypoints - len(image.first_keypoints))
-    if len(payload) != split + dim * image.num_keypoints:
+    if len(payload) != split + descriptor_bytes(dim, profile) * image.num_keypoints:
         raise DamageError(f"{image.name!r} has features that are not its own")
     others = np.frombuffer(payload[:split], "<u2").reshape(-1, 2)
-    fixed = np.concatenate([image.first_keypoints, others])
-    keypoints = (fixed * _keypoint_step_px(image.camera) - 0.5).astype(np.float32)
-    # A copy: the mapping is the snapshot's, which ends.
-    return keypoints, np.frombuffer(payload[split:], np.int8).reshape(-1, dim).copy()
+    return np.concatenate([image.first_keypoints, others]), payload[split:]
 
 
 def _keypoint_step_px(camera: Camera) -> float:
@@ -272,6 +338,7 @@ class Row(NamedTuple):
     """What retrieval knows of an image: its global descriptor is scale * numbers."""
 
     scale: np.float32
+    center: Array32  # (3,): where its camera was
     session: int
     numbers: NDArray[np.int8]  # (G,)
 
@@ -280,30 +347,81 @@ class Block(NamedTuple):
     """Retrieval rows of several images."""
 
     scales: Array32  # (n,)
+    centers: Array32  # (n, 3)
     sessions: NDArray[np.uint16]  # (n,)
     numbers: NDArray[np.int8]  # (n, G)
 
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Block]) -> Block:
+        """Put blocks, at least one, together."""
+        return cls._make(map(np.concatenate, zip(*blocks, strict=True)))
+
+    @property
+    def descriptors(self) -> Array32:
+        """The global descriptors (n, G)."""
+        return self.numbers * self.scales[:, None]
+
     def row(self, place: int) -> Row:
         """Copy one of them."""
-        return Row(self.scales[place], int(self.sessions[place]), self.numbers[place].copy())
+        return Row(
+            self.scales[place],
+            self.centers[place].copy(),
+            int(self.sessions[place]),
+            self.numbers[place].copy(),
+        )
+
+    def choose(self, places: NDArray[np.intp]) -> Block:
+        """Return some of them, in this order; all of them without a copy."""
+        if len(places) == len(self.scales):
+            return self
+        return Block._make(values[places] for values in self)
+
+    def encode(self) -> bytes:
+        """Write them."""
+        return b"".join(values.tobytes() for values in self)
 
 
 def encode_block(rows: Sequence[Row]) -> bytes:
     """Write retrieval rows."""
-    scales, sessions, numbers = zip(*rows, strict=True)
-    return (
-        np.array(scales, "<f4").tobytes()
-        + np.array(sessions, "<u2").tobytes()
-        + np.array(numbers, np.int8).tobytes()
-    )
+    scales, centers, sessions, numbers = zip(*rows, strict=True)
+    return Block(
+        np.array(scales, "<f4"),
+        np.array(centers, "<f4"),
+        np.array(sessions, "<u2"),
+        np.array(numbers, np.int8),
+    ).encode()
 
 
 def decode_block(payload: memoryview, dim: int) -> Block:
     """View retrieval rows of G = `dim` numbers where they lie."""
-    num_rows = len(payload) // (4 + 2 + dim)
-    scales, sessions = payload[: 4 * num_rows], payload[4 * num_rows : 6 * num_rows]
+    num_rows = len(payload) // (4 + 12 + 2 + dim)
+    ends = np.cumsum([0, 4 * num_rows, 12 * num_rows, 2 * num_rows, dim * num_rows]).tolist()
+    scales, centers, sessions, numbers = (payload[a:b] for a, b in pairwise(ends))
     return Block(
         np.frombuffer(scales, "<f4"),
+        np.frombuffer(centers, "<f4").reshape(-1, 3),
         np.frombuffer(sessions, "<u2"),
-        np.frombuffer(payload[6 * num_rows :], np.int8).reshape(-1, dim),
+        np.frombuffer(numbers, np.int8).reshape(-1, dim),
     )
+
+
+def encode_list(indices: NDArray[np.intp], rows: Block) -> bytes:
+    """Write a list of the index."""
+    return indices.astype("<u4").tobytes() + rows.encode()
+
+
+def decode_list(payload: memoryview, dim: int) -> tuple[NDArray[np.intp], Block]:
+    """Read the indices (n,) of a list of the index, and view its rows."""
+    num_rows = len(payload) // (4 + 4 + 12 + 2 + dim)
+    indices = np.frombuffer(payload[: 4 * num_rows], "<u4").astype(np.intp)
+    return indices, decode_block(payload[4 * num_rows :], dim)
+
+
+def encode_centroids(centroids: Array32) -> bytes:
+    """Write the centroids (L, G) of the index."""
+    return centroids.astype("<f2").tobytes()
+
+
+def decode_centroids(payload: memoryview, dim: int) -> Array32:
+    """Read the centroids (L, G) of the index."""
+    return np.frombuffer(payload, "<f2").reshape(-1, dim).astype(np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +14,11 @@ from typing import Self
 import lmdb
 import numpy as np
 from lmdb.verify import VerifyError, verify
+from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
 from trigpoint.database import schema
+from trigpoint.database.codec import Profile
 from trigpoint.database.pages import DamageError
 from trigpoint.database.snapshot import (
     Snapshot,
@@ -49,13 +51,20 @@ class MapWriter:
         self._has_removed = False  # since the last commit
         self._num_new_pages = 0  # since then, at the most
         self._sessions = list(metadata.sessions)
+        self._index = metadata.index
         self._rows: list[schema.Row] = []  # of the last retrieval block, unless it is full
         self._environment: lmdb.Environment | None = _writable_environment(path, fd)
         self._txn: lmdb.Transaction | None = None
 
     @classmethod
-    def create(cls, path: Path, model: ModelIdentity) -> Self:
-        """Make an empty map for features of a model."""
+    def create(
+        cls,
+        path: Path,
+        model: ModelIdentity,
+        profile: Profile = Profile.STANDARD,
+        generation: int = 0,
+    ) -> Self:
+        """Make an empty map for features of a model, of the generation that goes before."""
         with reporting(path), ExitStack() as undo:
             try:
                 fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
@@ -66,7 +75,7 @@ class MapWriter:
             undo.callback(path.unlink)
             undo.callback(os.close, fd)
             keep_writers_out(fd)
-            metadata = schema.Metadata(model)
+            metadata = schema.Metadata(model, generation, profile=profile)
             environment = _writable_environment(path, fd)
             with environment.begin(write=True) as txn:
                 _put(txn, schema.METADATA_KEY, metadata.encode())
@@ -104,6 +113,11 @@ class MapWriter:
         """Rises with each commit."""
         return self._metadata.generation
 
+    @property
+    def profile(self) -> Profile:
+        """What the map spends on an image."""
+        return self._metadata.profile
+
     def add(
         self,
         name: str,
@@ -117,15 +131,24 @@ class MapWriter:
             _require_name(name)
             _require_pose(name, cam_from_world)
             _require_features(name, features, camera, self._metadata.model)
-            image, arrays = schema.encode_image(name, camera, cam_from_world, features)
+            image, arrays = schema.encode_image(
+                name, camera, cam_from_world, features, self._metadata.profile
+            )
             scale, numbers = schema.quantize_row(features.global_descriptor)
-            row = schema.Row(scale, schema.NO_SESSION, numbers)
-            return self._append(txn, schema.Record(name, image, arrays, row, session))
+            center = cam_from_world.center.astype(np.float32)
+            row = schema.Row(scale, center, schema.NO_SESSION, numbers)
+            profile = self._metadata.profile
+            return self._append(txn, schema.Record(name, image, arrays, row, session, profile))
 
     def add_record(self, record: schema.Record, name: str) -> int:
-        """Add an image of another map of the same model under a name; return its index."""
+        """Add an image of another map of the same model under a name; return its index.
+
+        Where the profiles differ, its descriptors are written as this map has them.
+        """
         with self._writing() as txn:
             _require_name(name)
+            own, dim = self._metadata.profile, self._metadata.model.descriptor_dim
+            record = schema.recode(record, dim, own)
             image = schema.rename_image(record.image, name)
             return self._append(txn, replace(record, name=name, image=image))
 
@@ -171,6 +194,7 @@ class MapWriter:
                 self._delete(txn, key)
             if not self._rows:
                 self._delete(txn, schema.block_key(last // schema.BLOCK_ROWS))
+            self._note_moved(index, last)
             self._num_images, self._has_removed = last, True
 
     def _move(self, txn: lmdb.Transaction, source: int, target: int, row: schema.Row) -> None:
@@ -188,6 +212,27 @@ class MapWriter:
         rows[place] = row
         self._put(txn, key, schema.encode_block(rows))
 
+    def _note_moved(self, *indices: int) -> None:
+        """Remember that the index knows other rows of these indices."""
+        if self._index is not None:
+            moved = {*self._index.moved, *(i for i in indices if i < self._index.num_rows)}
+            self._index = replace(self._index, moved=tuple(sorted(moved)))
+
+    def put_index(
+        self,
+        num_rows: int,
+        centroids: NDArray[np.float32],
+        lists: Iterable[tuple[NDArray[np.intp], schema.Block]],
+    ) -> None:
+        """Put an index of the first rows, lists of indices and rows, in the place of the old."""
+        with self._writing() as txn:
+            for number in range(0 if self._index is None else self._index.num_lists):
+                self._delete(txn, schema.list_key(number))
+            self._put(txn, schema.CENTROIDS_KEY, schema.encode_centroids(centroids))
+            for number, (indices, rows) in enumerate(lists):
+                self._put(txn, schema.list_key(number), schema.encode_list(indices, rows))
+            self._index = schema.InvertedFile(num_rows, len(centroids))
+
     def set_pose_noise(self, noise: PoseNoise | None) -> None:
         """Say how well the poses of the map agree, None if that is not known."""
         self._pose_noise = noise
@@ -199,6 +244,7 @@ class MapWriter:
             num_images=self._num_images,
             pose_noise=self._pose_noise,
             sessions=tuple(self._sessions),
+            index=self._index,
         )
         if metadata == self._metadata and not self._has_removed:
             return
@@ -292,6 +338,8 @@ class MapWriter:
 
 
 def _put(txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
+    # LMDB would leave a value that shrinks twice in one commit more pages than `verify` accepts.
+    txn.delete(key)
     txn.put(key, schema.seal(key, payload))
 
 
