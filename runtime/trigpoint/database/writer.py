@@ -30,6 +30,9 @@ from trigpoint.errors import DatabaseError
 from trigpoint.frame import LocalFeatures, ModelIdentity, PoseNoise, Session
 from trigpoint.rigid import Rigid3
 
+MIN_PAGE_BYTES = 4096
+PAGES_A_CHANGE = 32  # that one entry, beside its value, may renew in LMDB's trees
+
 
 class MapWriter:
     """Adds and removes images. As a context it commits at the end; an exception drops the changes.
@@ -46,6 +49,7 @@ class MapWriter:
         self._num_images = metadata.num_images
         self._pose_noise = metadata.pose_noise
         self._has_removed = False  # since the last commit
+        self._num_new_pages = 0  # since then, at the most
         self._sessions = list(metadata.sessions)
         self._index = metadata.index
         self._rows: list[schema.Row] = []  # of the last retrieval block, unless it is full
@@ -143,9 +147,9 @@ class MapWriter:
             raise DatabaseError(f"holds an image {record.name!r} already")
         index = self._num_images
         row = record.row._replace(session=self._number_of(record.session))
-        _put(txn, schema.name_key(record.name), schema.encode_index(index))
-        _put(txn, schema.image_key(index), record.image)
-        _put(txn, schema.features_key(index), record.features)
+        self._put(txn, schema.name_key(record.name), schema.encode_index(index))
+        self._put(txn, schema.image_key(index), record.image)
+        self._put(txn, schema.features_key(index), record.features)
         self._rows.append(row)
         self._num_images += 1
         if len(self._rows) == schema.BLOCK_ROWS:
@@ -177,18 +181,18 @@ class MapWriter:
             if index != last:
                 self._move(txn, last, index, row)
             for key in (schema.name_key(name), schema.image_key(last), schema.features_key(last)):
-                txn.delete(key)
+                self._delete(txn, key)
             if not self._rows:
-                txn.delete(schema.block_key(last // schema.BLOCK_ROWS))
+                self._delete(txn, schema.block_key(last // schema.BLOCK_ROWS))
             self._note_moved(index, last)
             self._num_images, self._has_removed = last, True
 
     def _move(self, txn: lmdb.Transaction, source: int, target: int, row: schema.Row) -> None:
         """Give the image at the end, whose row has been taken off, another one's index."""
         for key_of in (schema.image_key, schema.features_key):
-            _put(txn, key_of(target), bytes(_get(txn, key_of(source))))
+            self._put(txn, key_of(target), bytes(_get(txn, key_of(source))))
         name = schema.decode_name(_get(txn, schema.image_key(source)))
-        _put(txn, schema.name_key(name), schema.encode_index(target))
+        self._put(txn, schema.name_key(name), schema.encode_index(target))
         block, place = divmod(target, schema.BLOCK_ROWS)
         if block == source // schema.BLOCK_ROWS:
             self._rows[place] = row
@@ -196,7 +200,7 @@ class MapWriter:
         key = schema.block_key(block)
         rows = self._decode_rows(_get(txn, key))
         rows[place] = row
-        _put(txn, key, schema.encode_block(rows))
+        self._put(txn, key, schema.encode_block(rows))
 
     def _note_moved(self, *indices: int) -> None:
         """Remember that the index knows other rows of these indices."""
@@ -213,10 +217,10 @@ class MapWriter:
         """Put an index of the first rows, lists of indices and rows, in the place of the old."""
         with self._writing() as txn:
             for number in range(0 if self._index is None else self._index.num_lists):
-                txn.delete(schema.list_key(number))
-            _put(txn, schema.CENTROIDS_KEY, schema.encode_centroids(centroids))
+                self._delete(txn, schema.list_key(number))
+            self._put(txn, schema.CENTROIDS_KEY, schema.encode_centroids(centroids))
             for number, (indices, rows) in enumerate(lists):
-                _put(txn, schema.list_key(number), schema.encode_list(indices, rows))
+                self._put(txn, schema.list_key(number), schema.encode_list(indices, rows))
             self._index = schema.InvertedFile(num_rows, len(centroids))
 
     def set_pose_noise(self, noise: PoseNoise | None) -> None:
@@ -238,21 +242,12 @@ class MapWriter:
             if self._rows:
                 self._put_last_block(txn)
             metadata = replace(metadata, generation=metadata.generation + 1)
-            _put(txn, schema.METADATA_KEY, metadata.encode())
+            self._put(txn, schema.METADATA_KEY, metadata.encode())
+            self._resize(self._num_new_pages)
             txn.commit()
+            self._resize(0)
             self._txn, self._metadata, self._has_removed = None, metadata, False
-            self._reach_last_page()
-
-    def _reach_last_page(self) -> None:
-        """Make the file as long as LMDB says: it does not write pages that it has given up again.
-
-        A file that is shorter counts as cut short.
-        """
-        assert self._environment is not None
-        pages = self._environment.info()["last_pgno"] + 1
-        size = pages * self._environment.stat()["psize"]
-        if os.fstat(self._fd).st_size < size:
-            os.ftruncate(self._fd, size)
+            self._num_new_pages = 0
 
     def copy_to(self, path: Path) -> None:
         """Write what was committed to a new file of the same owner and mode, without free pages."""
@@ -297,16 +292,35 @@ class MapWriter:
                 if self._txn is None:
                     self._txn = self._environment.begin(write=True)
                 yield self._txn
-            except lmdb.Error as error:
+            except (lmdb.Error, OSError) as error:
                 self.close()
+                reason = error.reason if isinstance(error, lmdb.Error) else error.strerror
                 raise DatabaseError(
-                    f"cannot be written: {error.reason}; is the disk full? The map is as it was "
+                    f"cannot be written: {reason}; is the disk full? The map is as it was "
                     "at the last commit"
                 ) from error
 
+    def _put(self, txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
+        _put(txn, key, payload)
+        self._num_new_pages += len(payload) // MIN_PAGE_BYTES + PAGES_A_CHANGE
+
+    def _delete(self, txn: lmdb.Transaction, key: bytes) -> None:
+        txn.delete(key)
+        self._num_new_pages += PAGES_A_CHANGE
+
+    def _resize(self, num_new_pages: int) -> None:
+        """Make the file hold all pages of the last commit, and so many that the next may add.
+
+        LMDB does not write pages that one commit takes and frees again: where these are the last,
+        the file would be shorter than it says, which readers take for a file cut short.
+        """
+        assert self._environment is not None
+        num_pages = self._environment.info()["last_pgno"] + 1 + num_new_pages
+        os.ftruncate(self._fd, num_pages * self._environment.stat()["psize"])
+
     def _put_last_block(self, txn: lmdb.Transaction) -> None:
         block = schema.encode_block(self._rows)
-        _put(txn, schema.block_key((self._num_images - 1) // schema.BLOCK_ROWS), block)
+        self._put(txn, schema.block_key((self._num_images - 1) // schema.BLOCK_ROWS), block)
 
     def _decode_rows(self, payload: memoryview) -> list[schema.Row]:
         block = schema.decode_block(payload, self._metadata.model.global_dim)
@@ -314,7 +328,7 @@ class MapWriter:
 
 
 def _put(txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
-    # LMDB would leave a value that shrinks twice in one commit more pages than `verify` accepts.
+    # Without it LMDB leaves a value that shrinks within a commit more pages than `verify` accepts.
     txn.delete(key)
     txn.put(key, schema.seal(key, payload))
 
