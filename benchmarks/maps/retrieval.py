@@ -13,6 +13,7 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
+from benchmarks.localizer.__main__ import say
 from benchmarks.maps.rows import Places
 from benchmarks.models.scores import markdown
 from trigpoint.camera import Camera
@@ -48,6 +49,7 @@ def report(surveys: Sequence[Array32], sizes: Sequence[int]) -> str:
             recall = np.mean([np.isin(a, b).mean() for a, b in zip(scanned, indexed, strict=True)])
             row = [f"{size:,}", "index", f"{spent:.0f}", f"{bytes_per_row:.0f}"]
             rows.append([*row, *tell(*numbers), f"{recall:.3f}"])
+            say(f"{size:,} images: {rows[-2:]}")
     header = [
         "images", "", "built in (s)", "bytes an image", "median (ms)", "p99", "diverse, median",
         "resident (MB)", "recall@20",

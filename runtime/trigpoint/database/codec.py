@@ -55,10 +55,12 @@ def decode_descriptors(payload: memoryview, dim: int, profile: Profile) -> NDArr
         # A copy: the mapping is the snapshot's, which ends.
         return np.frombuffer(payload, np.int8).reshape(-1, dim).copy()
     rotation = _rotation(dim)
-    levels = _levels_of_bytes()[np.frombuffer(payload, np.uint8)].reshape(-1, len(rotation))
-    numbers = (levels @ rotation)[:, :dim]
-    norms = np.sqrt(np.einsum("ij,ij->i", numbers, numbers, dtype=np.float64))
-    return quantize_descriptors((numbers / norms[:, None]).astype(np.float32))
+    levels = np.take(_levels_of_bytes(), np.frombuffer(payload, np.uint8), axis=0)
+    levels = levels.reshape(-1, len(rotation))
+    # Sums of integers below 2^24: exact in float32. The rotation multiplies lengths by sqrt(P).
+    squares = len(rotation) * np.einsum("ij,ij->i", levels, levels)
+    numbers = (levels @ rotation)[:, :dim] / np.sqrt(squares)[:, None]
+    return quantize_descriptors(numbers)
 
 
 @cache

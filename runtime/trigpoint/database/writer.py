@@ -338,7 +338,7 @@ class MapWriter:
 
 
 def _put(txn: lmdb.Transaction, key: bytes, payload: bytes) -> None:
-    # LMDB would leave a value that shrinks twice in one commit more pages than `verify` accepts.
+    # Without it LMDB leaves a value that shrinks within a commit more pages than `verify` accepts.
     txn.delete(key)
     txn.put(key, schema.seal(key, payload))
 
