@@ -13,7 +13,7 @@ from tests.conftest import Demo
 from tests.unit.conftest import Run
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
-from trigpoint_db.cli_report import choose_shown
+from trigpoint_db.commands.report import choose_shown
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.poses import Query, read_poses, write_poses, write_queries
 from trigpoint_db.report.matches import HEIGHT_PX, draw_pair

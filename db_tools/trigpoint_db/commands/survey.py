@@ -1,4 +1,4 @@
-"""Commands on how good the survey of a map is: `trigpoint-db select`, `coverage`."""
+"""Commands on surveys: `trigpoint-db select`, `coverage`, `align`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -20,6 +20,9 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.options import LocalizerOptions
 from trigpoint.output import check_output
 from trigpoint.rigid import Rigid3
+from trigpoint_db.align import Alignment, align_survey, choose_spread
+from trigpoint_db.build import append_map, check_files, select_new
+from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.coverage import (
     APART,
     GRADES,
@@ -35,10 +38,23 @@ from trigpoint_db.coverage import (
 from trigpoint_db.coverage_picture import draw_coverage
 from trigpoint_db.figures import check_picture, save_figure
 from trigpoint_db.gaps import Place, find_gaps, suggest_poses
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import read_model, write_model
 from trigpoint_db.maps import copy_without
 from trigpoint_db.poses import write_poses
 from trigpoint_db.selection import Density, Selection, select
-from trigpoint_db.terminal import Json, MapPath, Model, Retrieval, console, track
+from trigpoint_db.terminal import (
+    Json,
+    MapPath,
+    Model,
+    Retrieval,
+    SessionDate,
+    SessionName,
+    console,
+    make_session,
+    track,
+    track_calibration,
+)
 
 app = typer.Typer()
 DensityText = Annotated[
@@ -235,3 +251,78 @@ def print_coverage(map_: Path, coverage: Coverage, gaps: list[Place], wanted: li
         heading = np.rad2deg(headings(place.cam_from_world, coverage.axes))
         where = f"({x:.4g}, {y:.4g}, {z:.4g}) heading {heading:.0f} degrees"
         print(f"photograph {where}: {place.grade}, {place.reason}")
+
+
+@app.command()
+def align(
+    map_: MapPath,
+    source: Annotated[Path, typer.Argument(help="Folder of the survey's COLMAP model.")],
+    images: Annotated[Path, typer.Option(help="Folder of its images.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for it in the map's frame.")
+    ] = None,
+    apply: Annotated[bool, typer.Option("--apply", help="Add its images to the map.")] = False,
+    session: SessionName = None,
+    date: SessionDate = None,
+    sample: Annotated[
+        int, typer.Option(help="Localize so many of its images.", min=10, max=500)
+    ] = 100,
+    max_error: Annotated[
+        float,
+        typer.Option(help="Of an image that agrees: share of its distance; radians.", min=1e-4),
+    ] = 0.05,
+    model: Model = "base",
+    retrieval: Retrieval = None,
+    as_json: Json = False,
+) -> None:
+    """Bring a survey with poses of its own into the frame of a map, by localizing it there."""
+    survey = make_session(session, date)
+    if out is None and not apply:
+        raise ConfigError("give -o for the poses in the map's frame, --apply to add them, or both")
+    if out is not None and any((out / f"images{suffix}").exists() for suffix in (".txt", ".bin")):
+        raise ConfigError(f"{out} holds a COLMAP model already; name another folder")
+    posed = read_model(source)
+    if apply:
+        select_new(posed, map_, skip_existing=False)
+    check_files((image.name for image in posed), images)
+    network = FeatureModel.load(model, retrieval=retrieval)
+    with MapReader.open(map_, network.identity) as reader:
+        found = align_survey(
+            Localizer(network, reader, clock=time.perf_counter),
+            choose_spread(posed, sample),
+            images,
+            max_error=max_error,
+            track=lambda outcomes, total: track(outcomes, "localizing", total),
+        )
+    moved = found.move(posed)
+    if out is not None:
+        write_model(out, moved)
+    if apply:
+        append_map(map_, track(moved, "mapping", len(moved)), images, network, session=survey)
+        calibrate_map(map_, network, track_calibration)
+    print_alignment(found, moved, out=out, added_to=map_ if apply else None, as_json=as_json)
+
+
+def print_alignment(
+    found: Alignment,
+    moved: list[PosedImage],
+    *,
+    out: Path | None,
+    added_to: Path | None,
+    as_json: bool,
+) -> None:
+    """Print how well a survey fits, and where it is now."""
+    facts: dict[str, Any] = found.to_json()
+    if as_json:
+        written = {"model": out and str(out), "map": added_to and str(added_to)}
+        print(json.dumps(facts | written | {"num_images": len(moved)}))
+        return
+    print(
+        "{num_localized} of {num_tried} images localized, {num_agreeing} agree: scale {scale:.6g}, "
+        "turned by {rotation_deg:.3f} degrees\n"
+        "they are off by {median_position:.3g} and {median_rotation_deg:.3g} degrees (median), "
+        "{p90_position:.3g} and {p90_rotation_deg:.3g} degrees (90th percentile)".format(**facts)
+    )
+    for place in (out, added_to):
+        if place is not None:
+            print(f"{place}: {len(moved)} images of the survey")

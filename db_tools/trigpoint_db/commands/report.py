@@ -20,7 +20,7 @@ from trigpoint.output import check_output
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import match_anchors
 from trigpoint_db.build import check_files, read_frame
-from trigpoint_db.cli_survey import Apart, Probes, Up, measure, read_direction
+from trigpoint_db.commands.survey import Apart, Probes, Up, measure, read_direction
 from trigpoint_db.coverage import APART, Coverage, Probe, view_distance
 from trigpoint_db.evaluate import Evaluation, evaluate, read_truth
 from trigpoint_db.gaps import suggest_poses

@@ -1,14 +1,14 @@
-"""Commands on maps that are in use: `trigpoint-db remove`, `merge`, `align` and so on."""
+"""Commands on maps that are in use: `trigpoint-db info`, `remove`, `merge` and so on."""
 
 from __future__ import annotations
 
 import json
-import time
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.table import Table
 
@@ -16,16 +16,10 @@ from trigpoint.database.index import MIN_ROWS
 from trigpoint.database.reader import MapReader
 from trigpoint.database.replacing import compact_map
 from trigpoint.errors import ConfigError
-from trigpoint.localizer import Localizer
-from trigpoint.models.features import FeatureModel
-from trigpoint_db.align import Alignment, align_survey, choose_spread
-from trigpoint_db.build import append_map, check_files, select_new
-from trigpoint_db.calibrate import calibrate_map
-from trigpoint_db.importers.base import PosedImage
-from trigpoint_db.importers.colmap import read_model, write_model
 from trigpoint_db.maps import (
     Difference,
     compare_maps,
+    count_sessions,
     find_session,
     merge_maps,
     remove_images,
@@ -36,14 +30,8 @@ from trigpoint_db.terminal import (
     Json,
     MapPath,
     MapProfile,
-    Model,
-    Retrieval,
-    SessionDate,
-    SessionName,
     console,
-    make_session,
     track,
-    track_calibration,
 )
 from trigpoint_db.usage import Usage, count_usage, find_unused
 
@@ -236,75 +224,48 @@ def print_usage(what: str, used: dict[str, Usage], num_images: Counter[str] | No
 
 
 @app.command()
-def align(
-    map_: MapPath,
-    source: Annotated[Path, typer.Argument(help="Folder of the survey's COLMAP model.")],
-    images: Annotated[Path, typer.Option(help="Folder of its images.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for it in the map's frame.")
-    ] = None,
-    apply: Annotated[bool, typer.Option("--apply", help="Add its images to the map.")] = False,
-    session: SessionName = None,
-    date: SessionDate = None,
-    sample: Annotated[
-        int, typer.Option(help="Localize so many of its images.", min=10, max=500)
-    ] = 100,
-    max_error: Annotated[
-        float,
-        typer.Option(help="Of an image that agrees: share of its distance; radians.", min=1e-4),
-    ] = 0.05,
-    model: Model = "base",
-    retrieval: Retrieval = None,
-    as_json: Json = False,
-) -> None:
-    """Bring a survey with poses of its own into the frame of a map, by localizing it there."""
-    survey = make_session(session, date)
-    if out is None and not apply:
-        raise ConfigError("give -o for the poses in the map's frame, --apply to add them, or both")
-    if out is not None and any((out / f"images{suffix}").exists() for suffix in (".txt", ".bin")):
-        raise ConfigError(f"{out} holds a COLMAP model already; name another folder")
-    posed = read_model(source)
-    if apply:
-        select_new(posed, map_, skip_existing=False)
-    check_files((image.name for image in posed), images)
-    network = FeatureModel.load(model, retrieval=retrieval)
-    with MapReader.open(map_, network.identity) as reader:
-        found = align_survey(
-            Localizer(network, reader, clock=time.perf_counter),
-            choose_spread(posed, sample),
-            images,
-            max_error=max_error,
-            track=lambda outcomes, total: track(outcomes, "localizing", total),
-        )
-    moved = found.move(posed)
-    if out is not None:
-        write_model(out, moved)
-    if apply:
-        append_map(map_, track(moved, "mapping", len(moved)), images, network, session=survey)
-        calibrate_map(map_, network, track_calibration)
-    report(found, moved, out=out, added_to=map_ if apply else None, as_json=as_json)
-
-
-def report(
-    found: Alignment,
-    moved: list[PosedImage],
-    *,
-    out: Path | None,
-    added_to: Path | None,
-    as_json: bool,
-) -> None:
-    """Print how well a survey fits, and where it is now."""
-    facts: dict[str, Any] = found.to_json()
+def info(map_: MapPath, as_json: Json = False) -> None:
+    """Say what a map holds."""
+    with MapReader.open(map_) as reader:
+        centers = np.array([reader.view(i)[1].center for i in range(len(reader))])
+        facts: dict[str, Any] = {
+            "map": str(map_),
+            "num_images": len(reader),
+            "generation": reader.generation,
+            "model": reader.model.name,
+            "model_sha256": reader.model.sha256,
+            "profile": reader.profile,
+            "has_index": reader.has_index,
+            "descriptor_dim": reader.model.descriptor_dim,
+            "global_dim": reader.model.global_dim,
+            "pose_noise": reader.pose_noise and asdict(reader.pose_noise),
+            "sessions": count_sessions(reader),
+            "bytes": map_.stat().st_size,
+            "min_center": centers.min(axis=0).tolist() if len(centers) else None,
+            "max_center": centers.max(axis=0).tolist() if len(centers) else None,
+        }
     if as_json:
-        written = {"model": out and str(out), "map": added_to and str(added_to)}
-        print(json.dumps(facts | written | {"num_images": len(moved)}))
+        print(json.dumps(facts))
         return
-    print(
-        "{num_localized} of {num_tried} images localized, {num_agreeing} agree: scale {scale:.6g}, "
-        "turned by {rotation_deg:.3f} degrees\n"
-        "they are off by {median_position:.3g} and {median_rotation_deg:.3g} degrees (median), "
-        "{p90_position:.3g} and {p90_rotation_deg:.3g} degrees (90th percentile)".format(**facts)
-    )
-    for place in (out, added_to):
-        if place is not None:
-            print(f"{place}: {len(moved)} images of the survey")
+    table = Table(show_header=False)
+    for session in facts.pop("sessions"):
+        about = f"session {session['name'] or 'none'}", session["date"] or ""
+        table.add_row(" ".join(about), f"{session['num_images']} images")
+    for key, value in facts.items():
+        table.add_row(key, str(value))
+    console.print(table)
+
+
+@app.command()
+def verify(map_: MapPath, as_json: Json = False) -> None:
+    """Check every record of a map; exit code 1 where something is wrong."""
+    with MapReader.open(map_) as reader:
+        problems, count = reader.verify(), len(reader)
+    if as_json:
+        print(json.dumps({"map": str(map_), "num_images": count, "problems": problems}))
+    else:
+        for problem in problems:
+            print(problem)
+        print(f"{map_}: {count} images, {len(problems) or 'no'} problems")
+    if problems:
+        raise typer.Exit(1)
