@@ -12,7 +12,7 @@ from pathlib import Path
 from trigpoint.database.codec import Profile
 from trigpoint.database.index import MIN_ROWS, build_index
 from trigpoint.database.reader import MapReader
-from trigpoint.database.snapshot import put_in_place, reporting
+from trigpoint.database.snapshot import lock_path, put_in_place, reporting
 from trigpoint.database.writer import MapWriter, keep_writers_out
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import ModelIdentity
@@ -53,17 +53,8 @@ def resumable_map(
     _refuse_existing(path)
     partial = partial_map(path)
     with _open_partial(partial, model, profile or Profile.STANDARD) as writer:
-        if len(writer) and not resume:
-            raise DatabaseError(
-                f"{partial} holds {len(writer)} images of a build that was interrupted; go on with "
-                "--resume, or remove it"
-            )
-        if writer.profile != (profile or (writer.profile if resume else Profile.STANDARD)):
-            raise DatabaseError(
-                f"{partial} was begun with the {writer.profile} profile; go on with that one, or "
-                "remove it"
-            )
         try:
+            _require_begun_alike(writer, partial, profile, resume=resume)
             yield writer
         except BaseException:
             if writer.generation == 0:  # nothing to go on with
@@ -72,6 +63,21 @@ def resumable_map(
     _refuse_existing(path)
     partial.rename(path)
     _remove_map(partial)
+
+
+def _require_begun_alike(
+    writer: MapWriter, partial: Path, profile: Profile | None, *, resume: bool
+) -> None:
+    if len(writer) and not resume:
+        raise DatabaseError(
+            f"{partial} holds {len(writer)} images of a build that was interrupted; go on with "
+            "--resume, or remove it"
+        )
+    if writer.profile != (profile or (writer.profile if resume else Profile.STANDARD)):
+        raise DatabaseError(
+            f"{partial} was begun with the {writer.profile} profile; go on with that one, or "
+            "remove it"
+        )
 
 
 def _open_partial(partial: Path, model: ModelIdentity, profile: Profile) -> MapWriter:
@@ -223,7 +229,7 @@ def _partial_file(path: Path) -> Iterator[Path]:
 
 def _remove_map(path: Path) -> None:
     _remove(path)
-    _remove(path.with_name(path.name + "-lock"))
+    _remove(lock_path(path))
 
 
 def _remove(leftover: Path) -> None:

@@ -35,18 +35,18 @@ def share_environment(path: Path, fd: int) -> lmdb.Environment:
     path = path.resolve()  # LMDB names the lock file after the path: one name for all links
     status = os.fstat(fd)
     file = status.st_dev, status.st_ino
-    of_path = {
-        (key[2], key[3]): environment
-        for key, environment in _environments.items()
-        if key[:2] == (os.getpid(), path)
-    }
-    for (open_file, _), environment in of_path.items():
-        if open_file == file:
-            return environment
-    with _folder_held(path.parent):
+    with _folder_held(path.parent):  # against other threads too
+        of_path = {
+            (key[2], key[3]): environment
+            for key, environment in _environments.items()
+            if key[:2] == (os.getpid(), path)
+        }
+        for (open_file, _), environment in of_path.items():
+            if open_file == file:
+                return environment
         require_in_place(path, fd)
         if _lock_inode(path) in {lock for _, lock in of_path}:
-            _lock_path(path).unlink()  # of the file that was here before; this one needs its own
+            lock_path(path).unlink()  # of the file that was here before; this one needs its own
         environment = _open_environment(path)
         _environments[os.getpid(), path, file, _lock_inode(path)] = environment
     return environment
@@ -58,7 +58,7 @@ def put_in_place(new: Path, path: Path) -> None:
     with reporting(path), _folder_held(path.parent):
         new.rename(path)
         # It counts the readers of the old file, who keep both; the new one needs its own.
-        _lock_path(path).unlink(missing_ok=True)
+        lock_path(path).unlink(missing_ok=True)
 
 
 def require_in_place(path: Path, fd: int) -> None:
@@ -67,13 +67,14 @@ def require_in_place(path: Path, fd: int) -> None:
         raise DatabaseError("was replaced while it was being opened; try again")
 
 
-def _lock_path(path: Path) -> Path:
+def lock_path(path: Path) -> Path:
+    """Name LMDB's lock file of a map."""
     return path.with_name(path.name + "-lock")
 
 
 def _lock_inode(path: Path) -> int:
     try:
-        return _lock_path(path).stat().st_ino
+        return lock_path(path).stat().st_ino
     except FileNotFoundError:
         return 0
 
@@ -118,7 +119,7 @@ def _open_environment(path: Path) -> lmdb.Environment:
 
 def _reserve_lock(path: Path) -> None:
     """Give the lock file its space: LMDB writes it through a mapping, fatally on a full disk."""
-    fd = os.open(_lock_path(path), os.O_RDWR | os.O_CREAT, 0o644)
+    fd = os.open(lock_path(path), os.O_RDWR | os.O_CREAT, 0o644)
     try:
         os.posix_fallocate(fd, 0, LOCK_BYTES)
     finally:

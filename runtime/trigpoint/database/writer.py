@@ -22,6 +22,7 @@ from trigpoint.database.codec import Profile
 from trigpoint.database.pages import DamageError
 from trigpoint.database.snapshot import (
     Snapshot,
+    lock_path,
     reporting,
     require_in_place,
     share_environment,
@@ -73,6 +74,7 @@ class MapWriter:
             except FileNotFoundError:
                 raise DatabaseError("cannot be made: its folder does not exist") from None
             undo.callback(path.unlink)
+            undo.callback(lock_path(path).unlink, missing_ok=True)
             undo.callback(os.close, fd)
             keep_writers_out(fd)
             metadata = schema.Metadata(model, generation, profile=profile)
