@@ -244,6 +244,21 @@ def test_an_image_is_added_found_and_removed_while_the_map_is_in_use(
     assert "holds no image" in ask_small.error("map", action="remove", name=new.name)
 
 
+def test_an_image_is_added_to_a_session(
+    ask_small: Asker, demo: Demo, survey: list[PosedImage]
+) -> None:
+    image = survey[60]
+    asked: dict[str, Any] = {"name": image.name, "camera": "phone", "session": "spring"}
+    asked["cam_from_world"] = format_pose(image.cam_from_world)
+    payload = (files(demo, image), "image/jpeg")
+    said = ask_small.error("map", *payload, action="add", date="May 1st", **asked)
+    assert "date is 'May 1st'; write 2026-01-31" in said
+    without_name = {**asked, "session": ""}
+    assert "1 to 100" in ask_small.error("map", *payload, action="add", **without_name)
+    ask_small("map", *payload, action="add", date="2026-05-01", **asked)
+    assert ask_small("map")["sessions"] == ["spring (2026-05-01)"]
+
+
 @pytest.mark.parametrize(
     ("pose", "message"),
     [

@@ -250,6 +250,21 @@ def test_watch_follows_the_generations(office: Path, out: Path, endpoint: str) -
         assert fetch.poll() is None
 
 
+def test_watch_outlives_what_goes_wrong(office: Path, out: Path, endpoint: str) -> None:
+    MapWriter.create(out, MODEL).close()
+    with (
+        publishing(office, endpoint) as publisher,
+        process("trigpoint_db.cli", *fetching(out, endpoint, "--watch")) as fetch,
+    ):
+        with MapWriter.open(out, MODEL):  # a map that is written to is not replaced
+            assert fetch.stderr is not None
+            said = next(line for line in fetch.stderr if "another writer" in line)
+        assert said.endswith("; trying again\n")
+        extend(office)
+        assert publisher.refresh()
+        wait_until(lambda: generation_of(out) == generation_of(office))
+
+
 def test_a_full_disk_keeps_the_old_map(office: Path, tmp_path: Path, endpoint: str) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -75,13 +76,21 @@ def fetch(
     session = open_session(zenoh, connect, listen)
     try:
         remote = RemoteMap(session, check_key(key))
+        if not watch:
+            fetched = fetch_map(remote, out, patience_s=timeout, track=track)
+            _print(fetched, out, as_json=as_json)
+            return
+        said = ""
         while True:
-            patience_s = math.inf if watch else timeout
-            fetched = fetch_map(remote, out, patience_s=patience_s, track=track)
-            if fetched.is_new or not watch:
-                _print(fetched, out, as_json=as_json)
-            if not watch:
-                return
+            try:
+                fetched = fetch_map(remote, out, patience_s=math.inf, track=track)
+                said = ""
+                if fetched.is_new:
+                    _print(fetched, out, as_json=as_json)
+            except TrigpointError as error:  # a full disk, a wrong chunk: the next try may do
+                if str(error) != said:
+                    said = str(error)
+                    print(f"trigpoint-db: {said}; trying again", file=sys.stderr)
             remote.wait_for_news(_ASK_EVERY_S)
     finally:
         session.close()  # type: ignore[no-untyped-call]

@@ -23,6 +23,8 @@ from trigpoint.rigid import Rigid3
 from trigpoint_db.align import Alignment, align_survey, choose_spread
 from trigpoint_db.build import append_map, check_files, select_new
 from trigpoint_db.calibrate import calibrate_map
+from trigpoint_db.commands import datasets
+from trigpoint_db.commands.datasets import Format, Source
 from trigpoint_db.coverage import (
     APART,
     GRADES,
@@ -39,7 +41,8 @@ from trigpoint_db.coverage_picture import draw_coverage
 from trigpoint_db.figures import check_picture, save_figure
 from trigpoint_db.gaps import Place, find_gaps, suggest_poses
 from trigpoint_db.importers.base import PosedImage
-from trigpoint_db.importers.colmap import read_model, write_model
+from trigpoint_db.importers.colmap import write_model
+from trigpoint_db.importers.registry import read_dataset
 from trigpoint_db.maps import copy_without
 from trigpoint_db.poses import write_poses
 from trigpoint_db.selection import Density, Selection, select
@@ -256,8 +259,9 @@ def print_coverage(map_: Path, coverage: Coverage, gaps: list[Place], wanted: li
 @app.command()
 def align(
     map_: MapPath,
-    source: Annotated[Path, typer.Argument(help="Folder of the survey's COLMAP model.")],
-    images: Annotated[Path, typer.Option(help="Folder of its images.")],
+    source: Source,
+    format_: Format = None,
+    images: datasets.Images = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for it in the map's frame.")
     ] = None,
@@ -281,16 +285,17 @@ def align(
         raise ConfigError("give -o for the poses in the map's frame, --apply to add them, or both")
     if out is not None and any((out / f"images{suffix}").exists() for suffix in (".txt", ".bin")):
         raise ConfigError(f"{out} holds a COLMAP model already; name another folder")
-    posed = read_model(source)
+    dataset = read_dataset(source, format_, images=images)
+    posed = dataset.mapped
     if apply:
         select_new(posed, map_, skip_existing=False)
-    check_files((image.name for image in posed), images)
+    check_files((image.name for image in posed), dataset.images)
     network = FeatureModel.load(model, retrieval=retrieval)
     with MapReader.open(map_, network.identity) as reader:
         found = align_survey(
             Localizer(network, reader, clock=time.perf_counter),
             choose_spread(posed, sample),
-            images,
+            dataset.images,
             max_error=max_error,
             track=lambda outcomes, total: track(outcomes, "localizing", total),
         )
@@ -298,7 +303,9 @@ def align(
     if out is not None:
         write_model(out, moved)
     if apply:
-        append_map(map_, track(moved, "mapping", len(moved)), images, network, session=survey)
+        append_map(
+            map_, track(moved, "mapping", len(moved)), dataset.images, network, session=survey
+        )
         calibrate_map(map_, network, track_calibration)
     print_alignment(found, moved, out=out, added_to=map_ if apply else None, as_json=as_json)
 
