@@ -17,7 +17,7 @@ LIB = $(DESTDIR)$(PREFIX)/lib
 SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
 .PHONY: demo test kill-test test-oak test-systemd test-v4l2 check golden
-.PHONY: bench bench-building bench-models bench-localizer bench-daemon bench-maps soak wheel-test clean
+.PHONY: bench bench-building bench-models bench-localizer bench-daemon bench-maps walkthrough soak wheel-test clean
 .PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
@@ -118,6 +118,10 @@ $(DEMO)/map.tpmap: | $(READY)
 bench-maps: $(READY)
 	@mkdir -p build/bench
 	$(BIN)/python -m benchmarks.maps $(DATA) --output build/bench/maps.md
+
+# What the commands on maps print on real sets, into docs/maps.md; some ten minutes.
+walkthrough: $(READY)
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.maps.walkthrough $(DATA)
 
 # The suite against the installed wheel, not the checkout.
 wheel-test: $(READY)

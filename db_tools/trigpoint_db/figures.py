@@ -44,7 +44,7 @@ def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure as the kind of picture that the file's name ends in."""
     check_picture(path)
     try:
-        figure.savefig(path)
+        figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from error
 

@@ -19,18 +19,10 @@ from trigpoint.rigid import rotation_angle
 Track = Callable[[Sequence[int]], Iterable[int]]
 
 
-def count_sessions(reader: MapReader) -> list[dict[str, object]]:
-    """Say how many images each session has; those of none come last, if there are any."""
+def count_sessions(reader: MapReader) -> dict[Session | None, int]:
+    """Count the images of each session that has any; those of none come last."""
     counts = Counter(reader.sessions_by_index())
-    sessions: list[Session | None] = [*reader.sessions, *([None] if counts[None] else [])]
-    return [
-        {
-            "name": None if session is None else session.name,
-            "date": session and session.date and session.date.isoformat(),
-            "num_images": counts[session],
-        }
-        for session in sessions
-    ]
+    return {session: counts[session] for session in (*reader.sessions, None) if counts[session]}
 
 
 def find_session(path: Path, name: str) -> list[str]:

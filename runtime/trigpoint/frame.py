@@ -223,7 +223,7 @@ class Statistics:
     turned_deg: int = 0  # counterclockwise, of the image that the features are of
     generator: str = ""  # which hypothesis was refined: "anchor_pairs" or "latent_points"
     anchors: tuple[str, ...] = ()  # names, best first
-    anchor_inliers: tuple[int, ...] = ()  # of the last pose: how many each anchor sees
+    anchor_inliers: tuple[int, ...] = ()  # of the last pose, by anchor: those triangulated from it
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 
@@ -243,8 +243,6 @@ class Support:
         Which of them agree with the pose.
     anchors_from_world : Rigid3
         The anchors' poses (K,), in the order of `Statistics.anchors`.
-    anchor_inliers : (K,) int
-        How many of the inliers were triangulated from each; 0 where it has no say in the pose.
     """
 
     cam_from_world: Rigid3
@@ -252,7 +250,6 @@ class Support:
     points3d: NDArray[np.float64]
     inliers: NDArray[np.bool_]
     anchors_from_world: Rigid3
-    anchor_inliers: NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

@@ -303,15 +303,12 @@ def refine(
 
 def find_support(query: Query, latent: LatentPoints, refined: RefinedPose) -> Support:
     """Gather what a refined pose rests on."""
-    tracks = latent.tracks
-    views = tracks.view[np.repeat(refined.inliers, tracks.lengths)]
     return Support(
         refined.cam_from_world,
         query.points[latent.point],
         refined.points3d,
         refined.inliers,
         query.views,
-        np.bincount(views, minlength=len(query.views)),
     )
 
 

@@ -163,7 +163,7 @@ def build(
         unposed = f", {dataset.num_unposed} without a pose left out" * bool(dataset.num_unposed)
         advice = " left out" if select_ else "; --select leaves such images out"
         print(
-            f"{map_}: {count} images added{unposed}, {size / 1e6:.1f} MB; "
+            f"{map_}: {count} image{'s' * (count != 1)} added{unposed}, {size / 1e6:.1f} MB; "
             f"{selection}{advice * bool(selection.findings)}; {describe_noise(noise)}"
         )
 

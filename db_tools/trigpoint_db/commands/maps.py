@@ -16,6 +16,7 @@ from trigpoint.database.index import MIN_ROWS
 from trigpoint.database.reader import MapReader
 from trigpoint.database.replacing import compact_map
 from trigpoint.errors import ConfigError
+from trigpoint_db.commands.build import describe_noise
 from trigpoint_db.maps import (
     Difference,
     compare_maps,
@@ -227,6 +228,7 @@ def print_usage(what: str, used: dict[str, Usage], num_images: Counter[str] | No
 def info(map_: MapPath, as_json: Json = False) -> None:
     """Say what a map holds."""
     with MapReader.open(map_) as reader:
+        noise = reader.pose_noise
         centers = np.array([reader.view(i)[1].center for i in range(len(reader))])
         facts: dict[str, Any] = {
             "map": str(map_),
@@ -238,8 +240,15 @@ def info(map_: MapPath, as_json: Json = False) -> None:
             "has_index": reader.has_index,
             "descriptor_dim": reader.model.descriptor_dim,
             "global_dim": reader.model.global_dim,
-            "pose_noise": reader.pose_noise and asdict(reader.pose_noise),
-            "sessions": count_sessions(reader),
+            "pose_noise": noise and asdict(noise),
+            "sessions": [
+                {
+                    "name": session and session.name,
+                    "date": session and session.date and session.date.isoformat(),
+                    "num_images": count,
+                }
+                for session, count in count_sessions(reader).items()
+            ],
             "bytes": map_.stat().st_size,
             "min_center": centers.min(axis=0).tolist() if len(centers) else None,
             "max_center": centers.max(axis=0).tolist() if len(centers) else None,
@@ -248,11 +257,19 @@ def info(map_: MapPath, as_json: Json = False) -> None:
         print(json.dumps(facts))
         return
     table = Table(show_header=False)
-    for session in facts.pop("sessions"):
-        about = f"session {session['name'] or 'none'}", session["date"] or ""
-        table.add_row(" ".join(about), f"{session['num_images']} images")
-    for key, value in facts.items():
-        table.add_row(key, str(value))
+    table.add_row("images", str(facts["num_images"]))
+    for session in facts["sessions"]:
+        about = f"of session {session['name']}" if session["name"] else "of no session"
+        table.add_row(f"  {about} {session['date'] or ''}", str(session["num_images"]))
+    each = facts["bytes"] / 1e3 / max(facts["num_images"], 1)
+    table.add_row("size", f"{facts['bytes'] / 1e6:.1f} MB, {each:.1f} kB an image")
+    table.add_row("profile", f"{facts['profile']}, {'an' if facts['has_index'] else 'no'} index")
+    table.add_row("network", f"{facts['model']} ({facts['model_sha256'][:12]})")
+    table.add_row("generation", str(facts["generation"]))
+    if len(centers):
+        box = ",".join(f"{x:.4g}" for x in [*centers.min(axis=0), *centers.max(axis=0)])
+        table.add_row("cameras in the box", box)
+    table.add_row("poses", describe_noise(noise))
     console.print(table)
 
 

@@ -16,6 +16,7 @@ from trigpoint_db.coverage_picture import draw_coverage
 from trigpoint_db.evaluate import Evaluation, draw_paths, percentile
 from trigpoint_db.figures import make_figure, to_svg
 from trigpoint_db.gaps import Place
+from trigpoint_db.maps import count_sessions
 from trigpoint_db.report.page import Section, Table
 
 Array = NDArray[np.float64]
@@ -33,7 +34,7 @@ def map_section(reader: MapReader, num_bytes: int) -> Section:
     rows = [
         ["images", str(len(reader))],
         ["size", f"{num_bytes / 1e6:.1f} MB, {num_bytes / 1e3 / max(len(reader), 1):.1f} kB each"],
-        ["sessions", ", ".join(map(str, reader.sessions)) or "none"],
+        ["sessions", ", ".join(str(s) for s in count_sessions(reader) if s) or "none"],
         ["network", reader.model.name],
         ["extent of the cameras", extent],
         ["its poses agree", agree],
