@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from trigpoint.database import schema
 from trigpoint.database.pages import DamageError
 from trigpoint.database.ranking import find_largest
+from trigpoint.database.rows import Block, decode_block, decode_centroids, decode_list
 from trigpoint.database.snapshot import Snapshot
 from trigpoint.frame import Prior
 
@@ -48,15 +49,15 @@ class Retrieval:
         """How many blocks the rows are in."""
         return -(-self._metadata.num_images // schema.BLOCK_ROWS)
 
-    def blocks(self) -> Iterator[schema.Block]:
+    def blocks(self) -> Iterator[Block]:
         """Return all rows, block by block."""
         return (self.block(number) for number in range(self.num_blocks))
 
-    def block(self, number: int) -> schema.Block:
+    def block(self, number: int) -> Block:
         """Return a block of rows."""
         metadata = self._metadata
         payload = self.snapshot.get(schema.block_key(number))
-        block = schema.decode_block(payload, metadata.model.global_dim)
+        block = decode_block(payload, metadata.model.global_dim)
         wanted = min(metadata.num_images - number * schema.BLOCK_ROWS, schema.BLOCK_ROWS)
         if len(block.numbers) != wanted:
             raise DamageError(
@@ -66,7 +67,7 @@ class Retrieval:
             raise DamageError(f"retrieval block {number} has images of an unknown session")
         return block
 
-    def rows(self, indices: Index) -> Iterator[tuple[Index, schema.Block]]:
+    def rows(self, indices: Index) -> Iterator[tuple[Index, Block]]:
         """Return rows (K,), whose indices rise, block by block."""
         numbers = indices // schema.BLOCK_ROWS
         for here in np.split(indices, np.flatnonzero(np.diff(numbers)) + 1):
@@ -83,9 +84,9 @@ class Retrieval:
             descriptors[order] = np.concatenate(parts)
         return descriptors
 
-    def gather(self, indices: Index) -> schema.Block:
+    def gather(self, indices: Index) -> Block:
         """Put rows (K,), at least one, whose indices rise, together."""
-        return schema.Block.concatenate([block for _, block in self.rows(indices)])
+        return Block.concatenate([block for _, block in self.rows(indices)])
 
     @cached_property
     def centers(self) -> Array32:
@@ -139,10 +140,10 @@ class Retrieval:
             return Candidates(np.empty(0, np.intp), nothing, nothing)
         return Candidates._make(map(np.concatenate, zip(*found, strict=True))).best(num)
 
-    def indexed(self, number: int) -> tuple[Index, schema.Block]:
+    def indexed(self, number: int) -> tuple[Index, Block]:
         """Return a list of the index: the rows it knew, and their indices (n,) at that time."""
         payload = self.snapshot.get(schema.list_key(number))
-        return schema.decode_list(payload, self._metadata.model.global_dim)
+        return decode_list(payload, self._metadata.model.global_dim)
 
     def check_index(self, index: schema.InvertedFile) -> None:
         """Raise DamageError unless each row that the index knows is in one of its lists."""
@@ -159,10 +160,10 @@ class Retrieval:
     @cached_property
     def _centroids(self) -> Array32:
         payload = self.snapshot.get(schema.CENTROIDS_KEY)
-        return schema.decode_centroids(payload, self._metadata.model.global_dim)
+        return decode_centroids(payload, self._metadata.model.global_dim)
 
 
-def _compare(descriptor: Array32, bonus: Array32, indices: Index, rows: schema.Block) -> Candidates:
+def _compare(descriptor: Array32, bonus: Array32, indices: Index, rows: Block) -> Candidates:
     similarities = (rows.numbers.astype(np.float32) @ descriptor) * rows.scales
     scores = similarities + bonus[rows.sessions]
     kept = scores > -np.inf

@@ -18,8 +18,18 @@ from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
 from trigpoint.database import schema
+from trigpoint.database.admission import require_features, require_name, require_pose
 from trigpoint.database.codec import Profile
 from trigpoint.database.pages import DamageError
+from trigpoint.database.rows import (
+    Block,
+    Row,
+    decode_block,
+    encode_block,
+    encode_centroids,
+    encode_list,
+    quantize_row,
+)
 from trigpoint.database.snapshot import (
     Snapshot,
     lock_path,
@@ -53,7 +63,7 @@ class MapWriter:
         self._num_new_pages = 0  # since then, at the most
         self._sessions = list(metadata.sessions)
         self._index = metadata.index
-        self._rows: list[schema.Row] = []  # of the last retrieval block, unless it is full
+        self._rows: list[Row] = []  # of the last retrieval block, unless it is full
         self._environment: lmdb.Environment | None = _writable_environment(path, fd)
         self._txn: lmdb.Transaction | None = None
 
@@ -130,15 +140,15 @@ class MapWriter:
     ) -> int:
         """Add an image and return its index; one that cannot be added leaves no trace."""
         with self._writing() as txn:
-            _require_name(name)
-            _require_pose(name, cam_from_world)
-            _require_features(name, features, camera, self._metadata.model)
+            require_name(name)
+            require_pose(name, cam_from_world)
+            require_features(name, features, camera, self._metadata.model)
             image, arrays = schema.encode_image(
                 name, camera, cam_from_world, features, self._metadata.profile
             )
-            scale, numbers = schema.quantize_row(features.global_descriptor)
+            scale, numbers = quantize_row(features.global_descriptor)
             center = cam_from_world.center.astype(np.float32)
-            row = schema.Row(scale, center, schema.NO_SESSION, numbers)
+            row = Row(scale, center, schema.NO_SESSION, numbers)
             profile = self._metadata.profile
             return self._append(txn, schema.Record(name, image, arrays, row, session, profile))
 
@@ -148,7 +158,7 @@ class MapWriter:
         Where the profiles differ, its descriptors are written as this map has them.
         """
         with self._writing() as txn:
-            _require_name(name)
+            require_name(name)
             own, dim = self._metadata.profile, self._metadata.model.descriptor_dim
             record = schema.recode(record, dim, own)
             image = schema.rename_image(record.image, name)
@@ -181,7 +191,7 @@ class MapWriter:
     def remove(self, name: str) -> None:
         """Remove an image; the last one takes its index, so that there is no gap."""
         with self._writing() as txn:
-            _require_name(name)
+            require_name(name)
             if txn.get(schema.name_key(name)) is None:
                 raise DatabaseError(f"holds no image {name!r}")
             index = schema.decode_index(_get(txn, schema.name_key(name)))
@@ -199,7 +209,7 @@ class MapWriter:
             self._note_moved(index, last)
             self._num_images, self._has_removed = last, True
 
-    def _move(self, txn: lmdb.Transaction, source: int, target: int, row: schema.Row) -> None:
+    def _move(self, txn: lmdb.Transaction, source: int, target: int, row: Row) -> None:
         """Give the image at the end, whose row has been taken off, another one's index."""
         for key_of in (schema.image_key, schema.features_key):
             self._put(txn, key_of(target), bytes(_get(txn, key_of(source))))
@@ -212,7 +222,7 @@ class MapWriter:
         key = schema.block_key(block)
         rows = self._decode_rows(_get(txn, key))
         rows[place] = row
-        self._put(txn, key, schema.encode_block(rows))
+        self._put(txn, key, encode_block(rows))
 
     def _note_moved(self, *indices: int) -> None:
         """Remember that the index knows other rows of these indices."""
@@ -224,15 +234,15 @@ class MapWriter:
         self,
         num_rows: int,
         centroids: NDArray[np.float32],
-        lists: Iterable[tuple[NDArray[np.intp], schema.Block]],
+        lists: Iterable[tuple[NDArray[np.intp], Block]],
     ) -> None:
         """Put an index of the first rows, lists of indices and rows, in the place of the old."""
         with self._writing() as txn:
             for number in range(0 if self._index is None else self._index.num_lists):
                 self._delete(txn, schema.list_key(number))
-            self._put(txn, schema.CENTROIDS_KEY, schema.encode_centroids(centroids))
+            self._put(txn, schema.CENTROIDS_KEY, encode_centroids(centroids))
             for number, (indices, rows) in enumerate(lists):
-                self._put(txn, schema.list_key(number), schema.encode_list(indices, rows))
+                self._put(txn, schema.list_key(number), encode_list(indices, rows))
             self._index = schema.InvertedFile(num_rows, len(centroids))
 
     def set_pose_noise(self, noise: PoseNoise | None) -> None:
@@ -331,11 +341,11 @@ class MapWriter:
         os.ftruncate(self._fd, num_pages * self._environment.stat()["psize"])
 
     def _put_last_block(self, txn: lmdb.Transaction) -> None:
-        block = schema.encode_block(self._rows)
+        block = encode_block(self._rows)
         self._put(txn, schema.block_key((self._num_images - 1) // schema.BLOCK_ROWS), block)
 
-    def _decode_rows(self, payload: memoryview) -> list[schema.Row]:
-        block = schema.decode_block(payload, self._metadata.model.global_dim)
+    def _decode_rows(self, payload: memoryview) -> list[Row]:
+        block = decode_block(payload, self._metadata.model.global_dim)
         return [block.row(place) for place in range(len(block.scales))]
 
 
@@ -376,57 +386,3 @@ def _require_sound(path: Path) -> None:
         raise DamageError(str(error)) from error
     if problems:
         raise DamageError(problems[0])
-
-
-def _require_name(name: str) -> None:
-    try:
-        size = len(name.encode())
-    except UnicodeEncodeError as error:
-        raise DatabaseError(f"the name {name!r} is not valid Unicode") from error
-    if not 1 <= size <= schema.MAX_NAME_BYTES:
-        raise DatabaseError(
-            f"the name {name[:40]!r}... has {size} bytes; 1 to {schema.MAX_NAME_BYTES} are possible"
-        )
-
-
-def _require_pose(name: str, cam_from_world: Rigid3) -> None:
-    R, t = cam_from_world.R, cam_from_world.t
-    if R.shape != (3, 3) or t.shape != (3,):
-        raise DatabaseError(f"the pose of {name!r} is a batch, {R.shape} and {t.shape}")
-    if not (np.isfinite(R).all() and np.isfinite(t).all()):
-        raise DatabaseError(f"the pose of {name!r} is not finite")
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-5 or np.linalg.det(R) < 0:
-        raise DatabaseError(f"the R of {name!r} is no rotation")
-
-
-def _require_features(
-    name: str, features: LocalFeatures, camera: Camera, model: ModelIdentity
-) -> None:
-    num_keypoints = len(features)
-    if num_keypoints > schema.MAX_KEYPOINTS:
-        raise DatabaseError(
-            f"{name!r} has {num_keypoints} keypoints; {schema.MAX_KEYPOINTS} are possible"
-        )
-    shapes = {
-        "keypoints": (num_keypoints, 2),
-        "descriptors": (num_keypoints, model.descriptor_dim),
-        "global_descriptor": (model.global_dim,),
-    }
-    for field, shape in shapes.items():
-        array = getattr(features, field)
-        if array.shape != shape:
-            raise DatabaseError(
-                f"{name!r} has {field} {array.shape}; those of model {model.name!r} are {shape}"
-            )
-        if not np.isfinite(array).all():
-            raise DatabaseError(f"{name!r} has {field} that are not finite")
-    if len(camera.params) > schema.MAX_CAMERA_PARAMETERS:
-        raise DatabaseError(
-            f"{name!r} has a {camera.model} camera, which a map cannot hold; calibrate with k3 and "
-            "higher fixed at 0 (OPENCV), or undistort the images"
-        )
-    limit = (camera.width - 0.5, camera.height - 0.5)
-    if ((features.keypoints < -0.5) | (features.keypoints > limit)).any():
-        raise DatabaseError(
-            f"{name!r} has keypoints outside its {camera.width} x {camera.height} px"
-        )
