@@ -39,14 +39,14 @@ demo: $(READY)
 	@PATH="$(CURDIR)/$(BIN):$$PATH" sh demo.sh $(DEMO)
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: $(READY)
 	$(BIN)/ruff format --no-cache --check .
 	$(BIN)/ruff check --no-cache .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 # A map changed by processes that are killed at random moments; half a minute.
 kill-test: $(READY)
