@@ -33,7 +33,8 @@ INTRODUCTION = """# The paper's experiments
 What *Multiview Image-Based Localization* measures, measured again, beside the numbers that it
 gives. Every number and every verdict on this page is computed: `make experiments` measures anew
 what needs no public data set, and writes the page from the results in
-[experiments/](experiments). `trigpoint-db experiment --help` lists the commands.
+[experiments/](experiments). `trigpoint-db experiment --help` lists the commands; one that was
+interrupted goes on when it is given again.
 
 The real images are those in `DATA`, a folder for each set with `images/`, a COLMAP model in
 `sparse/`, and two splits: every fifth image is a query, or ("block") whole stretches are. Errors of
