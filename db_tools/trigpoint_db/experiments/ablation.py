@@ -232,8 +232,8 @@ def write_table(result: Mapping[str, Any]) -> str:
             f"One departure after the other taken back, {len(rows)} sets and splits. Ratios to the "
             "localizer as it is: geometric means of those of the medians and of the 90th "
             "percentiles of the position errors, where both are finite (lost queries have "
-            f"infinite errors), and of the median times. What covariance weights bring is the difference "
-            f"between the two rows with exact poses.{absent}" + describe_choice(result),
+            "infinite errors), and of the median times. What covariance weights bring is the "
+            f"difference between the two rows with exact poses.{absent}" + describe_choice(result),
             markdown(["taken back", "median", "90th percentile", "lost", "time"], overall),
             verdict,
             "The medians:",
