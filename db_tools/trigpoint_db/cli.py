@@ -9,6 +9,7 @@ import threadpoolctl
 import typer
 
 from trigpoint.errors import TrigpointError
+from trigpoint_db.experiments.cli import app as experiments
 from trigpoint_db.commands import (
     build,
     datasets,
@@ -29,6 +30,7 @@ app = typer.Typer(
 )
 for commands in (build, results, maps, survey, report, datasets, recordings, networks, fleet):
     app.add_typer(commands.app)  # on the same level
+app.add_typer(experiments, name="experiment")
 
 
 @app.callback()
