@@ -205,6 +205,16 @@ def agree_on_pose(
     return Reason.FEW_ANCHORS if isinstance(consensus, NoConsensus) else consensus
 
 
+def find_consistent(
+    anchors_from_world: Rigid3, query_from_anchors: Rigid3, options: LocalizerOptions
+) -> tuple[Rigid3, Rigid3] | Reason:
+    """Keep the anchors, and their relative poses, that agree on one pose."""
+    consensus = agree_on_pose(anchors_from_world, query_from_anchors, options)
+    if isinstance(consensus, Reason):
+        return consensus
+    return anchors_from_world[consensus.inliers], query_from_anchors[consensus.inliers]
+
+
 def average_poses(
     anchors_from_world: Rigid3, query_from_anchors: Rigid3, options: LocalizerOptions
 ) -> tuple[Rigid3, int] | Reason:
@@ -212,13 +222,10 @@ def average_poses(
 
     Returns the query's cam_from_world and how many anchors agree on it, or why there is none.
     """
-    consensus = agree_on_pose(anchors_from_world, query_from_anchors, options)
-    if isinstance(consensus, Reason):
-        return consensus
-    anchors, relative = (
-        anchors_from_world[consensus.inliers],
-        query_from_anchors[consensus.inliers],
-    )
+    consistent = find_consistent(anchors_from_world, query_from_anchors, options)
+    if isinstance(consistent, Reason):
+        return consistent
+    anchors, relative = consistent
     average = average_centers_robust if options.center == "robust" else average_centers
     center = average(anchors.center, center_directions(anchors, relative))
     if center is None:

@@ -7,7 +7,7 @@ from trigpoint.geometry.rotation_averaging import average_rotations
 from trigpoint.geometry.translation_averaging import average_translations
 from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
-from trigpoint.stages import agree_on_pose, estimate_relative_poses
+from trigpoint.stages import estimate_relative_poses, find_consistent
 from trigpoint_db.methods.matched import Matched
 
 
@@ -15,13 +15,10 @@ def estimate_pose(matched: Matched, options: LocalizerOptions) -> Rigid3 | Reaso
     """Average the translations and rotations of the anchors that agree."""
     query = matched.query
     chosen, query_from_anchors = estimate_relative_poses(query, options)
-    consensus = agree_on_pose(query.views[chosen], query_from_anchors, options)
-    if isinstance(consensus, Reason):
-        return consensus
-    anchors, relative = (
-        query.views[chosen][consensus.inliers],
-        query_from_anchors[consensus.inliers],
-    )
+    consistent = find_consistent(query.views[chosen], query_from_anchors, options)
+    if isinstance(consistent, Reason):
+        return consistent
+    anchors, relative = consistent
     translation = average_translations(anchors, relative)
     if translation is None:
         return Reason.DEGENERATE_ANCHORS
