@@ -11,7 +11,7 @@ import typer
 
 from trigpoint.errors import ConfigError
 from trigpoint.models.features import FeatureModel
-from trigpoint_db.experiments import anchors, averaging, methods, noise
+from trigpoint_db.experiments import ablation, anchors, averaging, methods, noise
 from trigpoint_db.experiments.page import write_page
 from trigpoint_db.experiments.sets import read_scenes, read_splits, read_wholes
 from trigpoint_db.experiments.store import Store
@@ -109,6 +109,24 @@ def methods_command(
     store, network = Store(output), FeatureModel.load(model)
     result = methods.measure(read_splits(data), network, num_anchors, queries, store)
     publish("methods", methods, result, store, as_json)
+
+
+@app.command("ablation")
+def ablation_command(
+    data: Annotated[Path, DATA],
+    output: Output = RESULTS,
+    queries: Annotated[int, typer.Option(help="Of each set and split, at the most.", min=1)] = 15,
+    model: Model = "base",
+    fp32: Annotated[
+        Path | None, typer.Option(help="The network in float32 (.onnx), to compare with INT8.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Take back our departures from the paper, one after the other: what each brings."""
+    sets, store, network = read_splits(data), Store(output), FeatureModel.load(model)
+    float_network = None if fp32 is None else FeatureModel.load(str(fp32))
+    result = ablation.measure(sets, network, float_network, queries, store)
+    publish("ablation", ablation, result, store, as_json)
 
 
 @app.command()
