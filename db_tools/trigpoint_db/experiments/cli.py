@@ -11,7 +11,7 @@ import typer
 
 from trigpoint.errors import ConfigError
 from trigpoint.models.features import FeatureModel
-from trigpoint_db.experiments import ablation, anchors, averaging, methods, noise
+from trigpoint_db.experiments import ablation, anchors, averaging, methods, noise, timing
 from trigpoint_db.experiments.page import write_page
 from trigpoint_db.experiments.sets import read_scenes, read_splits, read_wholes
 from trigpoint_db.experiments.store import Store
@@ -109,6 +109,24 @@ def methods_command(
     store, network = Store(output), FeatureModel.load(model)
     result = methods.measure(read_splits(data), network, num_anchors, queries, store)
     publish("methods", methods, result, store, as_json)
+
+
+@app.command("timing")
+def timing_command(
+    data: Annotated[Path, DATA],
+    hloc: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="A checkout of hloc, to time beside ours.")
+    ] = None,
+    output: Output = RESULTS,
+    queries: Annotated[int, typer.Option(help="Of all sets, at the most.", min=1)] = 20,
+    model: Model = "base",
+    as_json: Json = False,
+) -> None:
+    """Time by stage and bytes an image, with 20, 50 and 150 anchors (the paper's last table)."""
+    sets = {name: split for name, split in read_splits(data).items() if ", " not in name}
+    store, network = Store(output), FeatureModel.load(model)
+    result = timing.measure(sets, network, hloc, queries, store)
+    publish("timing", timing, result, store, as_json)
 
 
 @app.command("ablation")
