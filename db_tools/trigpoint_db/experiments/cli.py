@@ -113,7 +113,7 @@ def methods_command(
     as_json: Json = False,
 ) -> None:
     """Every method of `localize --method` on the same features, anchors and matches."""
-    store, network = Store(output), FeatureModel.load(model)
+    store, network = open_store(output), FeatureModel.load(model)
     result = methods.measure(read_splits(data), network, num_anchors, queries, store)
     publish("methods", methods, result, store, as_json)
 
@@ -131,7 +131,7 @@ def timing_command(
 ) -> None:
     """Time by stage and bytes an image, with 20, 50 and 150 anchors (the paper's last table)."""
     sets = {name: split for name, split in read_splits(data).items() if ", " not in name}
-    store, network = Store(output), FeatureModel.load(model)
+    store, network = open_store(output), FeatureModel.load(model)
     result = timing.measure(sets, network, hloc, queries, store)
     publish("timing", timing, result, store, as_json)
 

@@ -65,6 +65,7 @@ def measure(
     settings = {
         "network": network.identity.name,
         "num_anchors": num_anchors,
+        "max_queries": max_queries,
         "methods": [str(name) for name in names],
     }
     queries = {name: choose(dataset.queries, max_queries) for name, dataset in sets.items()}
@@ -157,7 +158,7 @@ def write_table(result: Mapping[str, Any]) -> str:
         f"`trigpoint-db localize --method`, on the same features (`{result['network']}`), "
         f"{result['num_anchors']} anchors, all at once, and matches, so that only what is done "
         "with these differs."
-        + describe_choice(rows)
+        + describe_choice(result)
         + "\n\n"
         + "\n".join(f"- `{name}`: {ABOUT[MethodName(name)]}." for name in methods)
     ]
