@@ -126,8 +126,8 @@ def test_beside_hloc_the_table_compares_stage_by_stage() -> None:
         for pipeline, spent in (("ours", ms), ("hloc", {key: 2 * ms[key] for key in ms}))
     ]
     result = {
-        "network": "base", "sets": ["hall"], "num_mapped": 9, "num_queries": 4, "num_chosen": 2,
-        "rows": rows,
+        "network": "base", "sets": ["hall"], "num_mapped": 400, "largest": 60,
+        "num_queries": 4, "num_chosen": 2, "rows": rows,
         "bytes": {"ours": 70e3, timing.HLOC_FEATURES: 100e3, timing.HLOC_MODEL: 40e3},
     }  # fmt: skip
     table = timing.write_table(result)
@@ -135,6 +135,7 @@ def test_beside_hloc_the_table_compares_stage_by_stage() -> None:
     assert "ours is 0.5 of hloc's" in table
     assert "| hloc's together | 140,000 |" in table
     assert "hloc is not here" not in table
+    assert "No set has more than 60 images: of 150 anchors" in table
 
 
 @pytest.mark.skipif(not PAPER.is_dir(), reason=f"needs the paper's source in {PAPER}")

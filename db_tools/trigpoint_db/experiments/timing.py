@@ -104,6 +104,7 @@ def measure(
     return {
         **settings,
         "num_mapped": len(joined.mapped),
+        "largest": max(len(dataset.mapped) for dataset in sets.values()),
         "num_queries": len(joined.queries),
         "num_chosen": len(queries),
         "rows": [summarize(cases) for cases in zip(*(store[key] for key in queries), strict=True)],
@@ -236,6 +237,11 @@ def write_table(result: Mapping[str, Any]) -> str:
         f"{result['num_mapped']} images (`{result['network']}`); medians in ms. {theirs}"
     )
     parts = [about, markdown(["anchors", "", "localized", *STAGES, TOTAL], cells, num_words=2)]
+    if beyond := [num for num in NUM_ANCHORS if result["largest"] < num <= result["num_mapped"]]:
+        parts.append(
+            f"No set has more than {result['largest']} images: of {' or '.join(map(str, beyond))} "
+            "anchors some show other places, and what is matched with them is wrong."
+        )
     if has_hloc:
         parts.append("\n".join(f"- {compare(rows, str(num))}" for num in NUM_ANCHORS))
     parts += [write_storage(result["bytes"]), write_paper(rows)]
@@ -304,8 +310,8 @@ def kilobytes(name: str) -> str:
 def draw(result: Mapping[str, Any], path: Path) -> None:
     """Draw the stages of each pipeline, one upon the other, and the bytes."""
     rows = result["rows"]
-    figure = make_figure(9, 1.5 + 0.4 * len(rows))
-    times, sizes = figure.subplots(1, 2, width_ratios=(3, 1))
+    figure = make_figure(10, 1.5 + 0.4 * len(rows))
+    times, sizes = figure.subplots(1, 2, width_ratios=(5, 2))
     labels = [f"{row['pipeline']}, {row['anchors']}" for row in rows]
     left = [0.0] * len(rows)
     for stage, color in STAGES.items():
@@ -325,7 +331,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
         bottom += kilo
     sizes.set_ylabel("kB an image")
     sizes.set_ylim(top=1.4 * max(ours, bottom))  # room for the legend
-    sizes.legend(fontsize="small")
+    sizes.legend(fontsize="small", handlelength=1, frameon=False)
     for axes, axis in ((times, "x"), (sizes, "y")):
         axes.grid(axis=axis, alpha=0.3)
         axes.set_axisbelow(True)
