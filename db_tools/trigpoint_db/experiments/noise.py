@@ -35,12 +35,10 @@ Array = NDArray[np.float64]
 
 NUM_ANCHORS = 20
 NOISE_DEG = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
-PERTURBED = {
-    "(R_kq, T_kq)": "of the query in the anchor",
-    "(R_qk, T_qk)": "of the anchor in the query",
-}
+IN_ANCHOR, IN_QUERY = "(R_kq, T_kq)", "(R_qk, T_qk)"
+PERTURBED = {IN_ANCHOR: "of the query in the anchor", IN_QUERY: "of the anchor in the query"}
 # What is perturbed, and how far the world's origin is from the scene's middle, in its radii.
-SETUPS = (("(R_kq, T_kq)", 0.0), ("(R_qk, T_qk)", 0.0), ("(R_kq, T_kq)", 3.0))
+SETUPS = ((IN_ANCHOR, 0.0), (IN_QUERY, 0.0), (IN_ANCHOR, 3.0))
 NOISES = {"rotation": (1.0, 0.0), "translation": (0.0, 1.0), "both": (1.0, 1.0)}
 AT_QUERY = "at the query"
 ORIGINS = (AT_QUERY, 0.0, 1.0, 3.0, 10.0, 30.0)
@@ -84,7 +82,7 @@ def measure(num_trials: int, store: Store) -> dict[str, Any]:
         (perturbed, noise, noise_deg, origin)
         for (perturbed, origin), noise, noise_deg in itertools.product(SETUPS, NOISES, NOISE_DEG)
     ]
-    origins = [(next(iter(PERTURBED)), "both", ORIGIN_NOISE_DEG, origin) for origin in ORIGINS]
+    origins = [(IN_ANCHOR, "both", ORIGIN_NOISE_DEG, origin) for origin in ORIGINS]
     runs = {" ".join(map(str, run)): run for run in (*levels, *origins)}
     for key in store.each(list(runs), "noise"):
         errors = run_trials(num_trials, *runs[key])
@@ -127,7 +125,7 @@ def run_trials(
     )
     anchors = Rigid3.from_center(R, centers)
     relative = Rigid3.from_center(R_q, center_q) @ anchors.inverse()  # query_from_anchors
-    if perturbed == "(R_qk, T_qk)":
+    if perturbed == IN_QUERY:
         relative = Rigid3(N_R @ relative.R, rotate(N_T, relative.t))
     else:
         inverse = relative.inverse()
@@ -196,7 +194,7 @@ def write_table(result: Mapping[str, Any]) -> str:
     first = result["origins"][0]
     parts.append(
         f"Translation averaging depends on where the world's origin is. With {first['noise']} "
-        f"noises of {number(first['noise_deg'])} degrees on {first['perturbed']}, by its distance "
+        f"noises of {number(first['noise_deg'])} degree on {first['perturbed']}, by its distance "
         "from the ball's center in radii:\n\n" + markdown(["origin", *METHODS], cells)
     )
     return "\n\n".join(parts)
