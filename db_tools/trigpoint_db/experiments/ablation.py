@@ -20,6 +20,7 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import Query
+from trigpoint_db import poses
 from trigpoint_db.build import read_frame
 from trigpoint_db.experiments.averaging import describe_choice
 from trigpoint_db.experiments.sets import choose, open_map
@@ -27,7 +28,6 @@ from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import geometric_mean, markdown, median, number
 from trigpoint_db.figures import label_plainly, make_figure, save_figure
 from trigpoint_db.importers.base import Dataset
-from trigpoint_db.poses import Query as AskedImage
 
 
 class PlainRefinement(Localizer):
@@ -152,7 +152,7 @@ def measure(
 
 
 def localize(
-    localizers: Mapping[str, Localizer], dataset: Dataset, query: AskedImage, first: int
+    localizers: Mapping[str, Localizer], dataset: Dataset, query: poses.Query, first: int
 ) -> dict[str, dict[str, float | None]]:
     """Return each localizer's position error, None where the query is lost, and its time.
 
