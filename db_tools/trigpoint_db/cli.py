@@ -297,10 +297,10 @@ def localize(
     with MapReader.open(map_, network.identity) as reader, ExitStack() as stack:
         if len(reader) == 0:
             raise ConfigError(f"{map_} holds no images; add some: trigpoint-db build --append")
-        lines = None if results is None else stack.enter_context(open_text(results))
         localizer = Localizer(network, reader, options, time.perf_counter, matching)
         is_own = method == MethodName.LATENT_POINTS
         solver = localizer if is_own else Baseline(method, localizer)
+        lines = None if results is None else stack.enter_context(open_text(results))
         localized = localize_images(solver, wanted, images, around)
         outcomes = []
         for outcome in track(localized, "localizing", len(wanted)):

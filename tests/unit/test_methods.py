@@ -14,7 +14,6 @@ from tests.unit.conftest import Run
 from tests.unit.scenes import Scene, generator, make_scene
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
-from trigpoint.errors import ConfigError
 from trigpoint.frame import Anchor, Frame, LocalFeatures, Lost, Prior, Reason, Statistics
 from trigpoint.geometry.rotation_averaging import average_rotations
 from trigpoint.images import read_gray
@@ -201,9 +200,17 @@ def test_poses_and_results_are_written_like_those_of_the_localizer(
     assert names[0] in (tmp_path / "report.html").read_text()
 
 
-def test_map_pnp_without_pycolmap_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_map_pnp_without_pycolmap_says_what_to_install(
+    run: Run, demo: Demo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delattr("trigpoint_db.methods.map_pnp", raising=False)
     monkeypatch.delitem(sys.modules, "trigpoint_db.methods.map_pnp", raising=False)
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(ConfigError, match=r"pip install 'trigpoint\[colmap\]'"):
-        load_method(MethodName.MAP_PNP)
+    code, _, err = run(
+        "localize", demo.map, "--images", demo.folder / "flight", "--method", "map-pnp",
+        "--queries", demo.folder / "queries.txt", "--poses", tmp_path / "poses.txt",
+        "--results", tmp_path / "results.jsonl",
+    )  # fmt: skip
+    assert code == 1
+    assert "pip install 'trigpoint[colmap]'" in err
+    assert list(tmp_path.iterdir()) == []  # before any work
