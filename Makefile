@@ -116,7 +116,9 @@ $(DEMO)/map.tpmap: | $(READY)
 	$(BIN)/trigpoint-db demo $(DEMO)
 
 # The paper's experiments, as far as they need no public data set, and docs/experiments.md; about
-# 20 minutes. What is interrupted goes on. INT8 is compared with FP32 where that network is.
+# 20 minutes. What is interrupted goes on. INT8 is compared with FP32 where that network is, times with
+# hloc's where its checkout is named (it needs h5py, tqdm and packaging):
+# make experiments HLOC=../Hierarchical-Localization
 EXPERIMENTS := build/experiments
 FLOAT = $(or $(FP32),$(wildcard build/fp32))
 experiments: $(READY)
@@ -125,6 +127,9 @@ experiments: $(READY)
 	$(BIN)/trigpoint-db experiment anchors --data $(DATA) --output $(EXPERIMENTS) >/dev/null
 	$(BIN)/trigpoint-db experiment ablation --data $(DATA) --output $(EXPERIMENTS) \
 	  $(if $(FLOAT),--fp32 '$(FLOAT)') >/dev/null
+	$(BIN)/trigpoint-db experiment methods --data $(DATA) --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment timing --data $(DATA) --output $(EXPERIMENTS) \
+	  $(if $(HLOC),--hloc '$(HLOC)') >/dev/null
 	$(BIN)/trigpoint-db experiment page $(EXPERIMENTS) docs
 	rm -rf $(EXPERIMENTS)/maps # the next run measures anew
 

@@ -11,7 +11,7 @@ import typer
 
 from trigpoint.errors import ConfigError
 from trigpoint.models.features import FeatureModel
-from trigpoint_db.experiments import ablation, anchors, averaging, noise
+from trigpoint_db.experiments import ablation, anchors, averaging, methods, noise, timing
 from trigpoint_db.experiments.page import write_page
 from trigpoint_db.experiments.sets import read_scenes, read_splits, read_wholes
 from trigpoint_db.experiments.store import Store
@@ -101,6 +101,39 @@ def anchors_command(
     store, network = open_store(output), FeatureModel.load(model)
     result = anchors.measure(dict(wholes[:sets]), network, images, store)
     publish("anchors", anchors, result, store, as_json)
+
+
+@app.command("methods")
+def methods_command(
+    data: Annotated[Path, DATA],
+    output: Output = RESULTS,
+    num_anchors: Annotated[int, typer.Option("--anchors", help="For each query.", min=2)] = 20,
+    queries: Annotated[int, typer.Option(help="Of each set, at the most.", min=1)] = 10,
+    model: Model = "base",
+    as_json: Json = False,
+) -> None:
+    """Every method of `localize --method` on the same features, anchors and matches."""
+    store, network = open_store(output), FeatureModel.load(model)
+    result = methods.measure(read_splits(data), network, num_anchors, queries, store)
+    publish("methods", methods, result, store, as_json)
+
+
+@app.command("timing")
+def timing_command(
+    data: Annotated[Path, DATA],
+    hloc: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="A checkout of hloc, to time beside ours.")
+    ] = None,
+    output: Output = RESULTS,
+    queries: Annotated[int, typer.Option(help="Of all sets, at the most.", min=1)] = 20,
+    model: Model = "base",
+    as_json: Json = False,
+) -> None:
+    """Time by stage and bytes an image, with 20, 50 and 150 anchors (the paper's last table)."""
+    sets = {name: split for name, split in read_splits(data).items() if ", " not in name}
+    store, network = open_store(output), FeatureModel.load(model)
+    result = timing.measure(sets, network, hloc, queries, store)
+    publish("timing", timing, result, store, as_json)
 
 
 @app.command("ablation")
