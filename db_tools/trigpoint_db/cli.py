@@ -44,6 +44,7 @@ from trigpoint_db.cli_survey import DensityAngle, DensityText, check_images, rea
 from trigpoint_db.cli_survey import app as survey_app
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths, read_truth
+from trigpoint_db.experiments.cli import app as experiments
 from trigpoint_db.extraction import NetworkFiles, open_crew
 from trigpoint_db.fleet import cli as fleet_cli
 from trigpoint_db.importers import cli as importers_cli
@@ -88,6 +89,7 @@ app.add_typer(importers_cli.app)
 app.add_typer(fleet_cli.app)
 app.add_typer(survey_app)
 app.add_typer(report_app)
+app.add_typer(experiments, name="experiment")
 
 
 @app.callback()

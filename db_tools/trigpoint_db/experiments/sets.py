@@ -1,0 +1,108 @@
+"""Posed images that experiments measure on: folders with both splits, and public data sets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from trigpoint.database.reader import MapReader
+from trigpoint.errors import ConfigError, TrigpointError
+from trigpoint.models.features import FeatureModel
+from trigpoint_db.build import build_map, check_files, select_images
+from trigpoint_db.calibrate import calibrate_map
+from trigpoint_db.importers import cambridge, seven_scenes
+from trigpoint_db.importers.base import Dataset
+from trigpoint_db.importers.colmap import read_model
+from trigpoint_db.importers.registry import read_dataset
+from trigpoint_db.poses import read_names
+from trigpoint_db.terminal import track
+
+SPLITS = {"": "", ", block": "_block"}  # how they are named in tables, and in the files' names
+
+
+def read_splits(data: Path) -> dict[str, Dataset]:
+    """Read the sets in a folder, each with its splits: `map.txt` and `queries.txt`, `*_block.txt`.
+
+    Each is a folder with `images/` and a COLMAP model in `sparse/`.
+    """
+    found = {}
+    for folder in find_sets(data):
+        posed = read_model(folder / "sparse")
+        for label, suffix in SPLITS.items():
+            names = folder / f"map{suffix}.txt", folder / f"queries{suffix}.txt"
+            if all(path.is_file() for path in names):
+                mapped, tested = (select_images(posed, read_names(path)) for path in names)
+                check_files((image.name for image in (*mapped, *tested)), folder / "images")
+                found[folder.name + label] = Dataset.from_split(folder / "images", mapped, tested)
+    if not found:
+        raise ConfigError(f"no set in {data} has map.txt and queries.txt, the names of a split")
+    return found
+
+
+def read_wholes(data: Path) -> dict[str, Dataset]:
+    """Read the same sets, with all of their images in the map and no queries."""
+    return {
+        folder.name: Dataset(folder / "images", read_model(folder / "sparse"))
+        for folder in find_sets(data)
+    }
+
+
+def read_scenes(root: Path) -> dict[str, Dataset]:
+    """Read the scenes of 7-Scenes or Cambridge Landmarks in a folder, or the one that it is."""
+    if not root.is_dir():
+        raise ConfigError(f"there is no folder {root}")
+    folders = [root, *sorted(path for path in root.iterdir() if path.is_dir())]
+    scenes = {
+        folder.resolve().name: read_dataset(folder)
+        for folder in folders
+        if seven_scenes.detect(folder) or cambridge.detect(folder)
+    }
+    if not scenes:
+        raise ConfigError(
+            f"{root} holds no scene of 7-Scenes or Cambridge Landmarks; docs/maps.md says how "
+            "they are unpacked"
+        )
+    return scenes
+
+
+def find_sets(data: Path) -> list[Path]:
+    """List the folders of sets."""
+    folders = sorted(path.parent for path in data.glob("*/sparse") if path.is_dir())
+    if not folders:
+        raise ConfigError(
+            f"{data} holds no sets; each is a folder with images/, a COLMAP model in sparse/, "
+            "and map.txt and queries.txt"
+        )
+    return folders
+
+
+@contextmanager
+def open_map(
+    folder: Path, name: str, dataset: Dataset, network: FeatureModel
+) -> Iterator[MapReader]:
+    """Open the map of a data set that is in a folder, or made there."""
+    path = folder / f"{name.replace(', ', '_')}_{network.identity.name}.tpmap"
+    if not is_map_of(path, dataset, network):
+        folder.mkdir(parents=True, exist_ok=True)
+        images = dataset.mapped
+        build_map(path, track(images, f"{name}: map", len(images)), dataset.images, network)
+        calibrate_map(path, network)
+    with MapReader.open(path, network.identity) as reader:
+        yield reader
+
+
+def is_map_of(path: Path, dataset: Dataset, network: FeatureModel) -> bool:
+    """Say whether there is a map of these images and poses, by this network."""
+    if not path.is_file():
+        return False
+    try:
+        with MapReader.open(path, network.identity) as reader:
+            return reader.names() == [image.name for image in dataset.mapped] and all(
+                np.allclose(reader.view(i)[1].t, image.cam_from_world.t)
+                for i, image in enumerate(dataset.mapped)
+            )
+    except TrigpointError:
+        return False
