@@ -189,13 +189,10 @@ def estimate_relative_poses(query: Query, options: LocalizerOptions) -> tuple[In
     return np.array(chosen, dtype=np.intp), Rigid3.stack(poses)
 
 
-def average_poses(
+def find_consistent(
     anchors_from_world: Rigid3, query_from_anchors: Rigid3, options: LocalizerOptions
-) -> tuple[Rigid3, int] | Reason:
-    """Stage 1 of the paper: RANSAC over anchor pairs, center averaging, rotation averaging.
-
-    Returns the query's cam_from_world and how many anchors agree on it, or why there is none.
-    """
+) -> tuple[Rigid3, Rigid3] | Reason:
+    """Keep the anchors, and their relative poses, that agree on one pose: RANSAC over pairs."""
     if len(anchors_from_world) < 2:
         return Reason.FEW_ANCHORS
     consensus = find_consensus(
@@ -209,10 +206,20 @@ def average_poses(
         return Reason.DEGENERATE_ANCHORS
     if isinstance(consensus, NoConsensus):
         return Reason.FEW_ANCHORS
-    anchors, relative = (
-        anchors_from_world[consensus.inliers],
-        query_from_anchors[consensus.inliers],
-    )
+    return anchors_from_world[consensus.inliers], query_from_anchors[consensus.inliers]
+
+
+def average_poses(
+    anchors_from_world: Rigid3, query_from_anchors: Rigid3, options: LocalizerOptions
+) -> tuple[Rigid3, int] | Reason:
+    """Stage 1 of the paper: RANSAC over anchor pairs, center averaging, rotation averaging.
+
+    Returns the query's cam_from_world and how many anchors agree on it, or why there is none.
+    """
+    consistent = find_consistent(anchors_from_world, query_from_anchors, options)
+    if isinstance(consistent, Reason):
+        return consistent
+    anchors, relative = consistent
     average = average_centers_robust if options.center == "robust" else average_centers
     center = average(anchors.center, center_directions(anchors, relative))
     if center is None:

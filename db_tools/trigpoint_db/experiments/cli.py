@@ -9,20 +9,25 @@ from typing import Annotated, Any, Protocol
 
 import typer
 
-from trigpoint_db.experiments import noise
+from trigpoint.errors import ConfigError
+from trigpoint.models.features import FeatureModel
+from trigpoint_db.experiments import anchors, averaging, noise
 from trigpoint_db.experiments.page import write_page
+from trigpoint_db.experiments.sets import read_scenes, read_splits, read_wholes
 from trigpoint_db.experiments.store import Store
-from trigpoint_db.terminal import Json
+from trigpoint_db.terminal import Json, Model
 
 app = typer.Typer(help="The paper's experiments: measure, and write tables and pictures.")
 
 Output = Annotated[
     Path, typer.Option(metavar="DIR", help="Results, and the pictures of them; made if missing.")
 ]
-Data = Annotated[
-    Path,
-    typer.Option(metavar="DIR", help="Folders with images/, sparse/, map.txt and queries.txt."),
-]
+DATA = typer.Option(
+    "--data", metavar="DIR", help="Folders with images/, sparse/, map.txt and queries.txt."
+)
+ROOT = typer.Option(
+    "--root", metavar="DIR", help="Scenes of 7-Scenes or Cambridge Landmarks, or one of them."
+)
 RESULTS = Path("experiments")
 
 
@@ -54,6 +59,41 @@ def noise_command(
     """Synthetic cameras: how center and translation averaging stand noise (the paper's figure)."""
     store = Store(output)
     publish("noise", noise, noise.measure(trials, store), store, as_json)
+
+
+@app.command("averaging")
+def averaging_command(
+    data: Annotated[Path | None, DATA] = None,
+    root: Annotated[Path | None, ROOT] = None,
+    output: Output = RESULTS,
+    num_anchors: Annotated[int, typer.Option("--anchors", help="For each query.", min=2)] = 20,
+    queries: Annotated[int, typer.Option(help="Of each set, at the most.", min=1)] = 100,
+    model: Model = "base",
+    as_json: Json = False,
+) -> None:
+    """Center against translation averaging on real images (the paper's first table)."""
+    if data is None and root is None:
+        raise ConfigError("there is nothing to measure on: give --data or --root")
+    sets = ({} if data is None else read_splits(data)) | ({} if root is None else read_scenes(root))
+    store, network = Store(output), FeatureModel.load(model)
+    result = averaging.measure(sets, network, num_anchors, queries, store)
+    publish("averaging", averaging, result, store, as_json)
+
+
+@app.command("anchors")
+def anchors_command(
+    data: Annotated[Path, DATA],
+    output: Output = RESULTS,
+    sets: Annotated[int, typer.Option(help="So many of them, the largest.", min=1)] = 2,
+    images: Annotated[int, typer.Option(help="Of each set, at the most.", min=1)] = 30,
+    model: Model = "base",
+    as_json: Json = False,
+) -> None:
+    """Error and time by the number of anchors, from 2 to 150 (the paper's figure "ksweep")."""
+    wholes = sorted(read_wholes(data).items(), key=lambda item: -len(item[1].mapped))
+    store, network = Store(output), FeatureModel.load(model)
+    result = anchors.measure(dict(wholes[:sets]), network, images, store)
+    publish("anchors", anchors, result, store, as_json)
 
 
 @app.command()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from trigpoint_db.importers.registry import read_dataset
 from trigpoint_db.poses import read_names
 from trigpoint_db.terminal import track, track_calibration
 
+T = TypeVar("T")
 SPLITS = {"": "", ", block": "_block"}  # how they are named in tables, and in the files' names
 
 
@@ -110,3 +112,9 @@ def is_map_of(path: Path, dataset: Dataset, network: FeatureModel) -> bool:
             )
     except TrigpointError:
         return False
+
+
+def choose(items: Sequence[T], num: int) -> list[T]:
+    """Choose so many items at the most, by a fixed seed, and keep their order."""
+    chosen = np.random.default_rng(0).permutation(len(items))[:num]
+    return [items[place] for place in sorted(chosen.tolist())]
