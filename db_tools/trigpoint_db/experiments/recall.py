@@ -52,7 +52,7 @@ POSSIBLE = "most possible"
 CHANCE = "at random"
 
 ROOM = "rendered room"
-ROOM_SEED, NUM_SURVEY, NUM_FLIGHT = 0, 140, 24
+ROOM_SEED = 0
 SHOWN_ROWS, SHOWN_COLUMNS = 4, 5
 THUMBNAIL = Camera("PINHOLE", 120, 90, (86.0, 86.0, 59.5, 44.5))
 GRAY_STEP = 24  # few levels, for a small file
@@ -63,6 +63,9 @@ def measure(
     model: FeatureModel,
     external: RetrievalModel | None,
     store: Store,
+    *,
+    num_survey: int = 140,
+    num_flight: int = 24,
 ) -> dict[str, Any]:
     """Rank the images of maps by their likeness to queries, in several ways.
 
@@ -75,6 +78,8 @@ def measure(
     external : RetrievalModel, optional
         Gives another one to compare with; tiny images do so in any case.
     store : Store
+    num_survey, num_flight : int
+        Mapped images of the rendered room, and queries there.
     """
     others: dict[str, Describe] = {TINY: describe_tiny}
     if external is not None:
@@ -83,13 +88,17 @@ def measure(
         "model": model.identity.sha256,
         "others": list(others),
         "sets": {name: len(dataset.queries) for name, dataset in sets.items()},
+        "room": [num_survey, num_flight],
     }
     store.begin("recall", settings)
     names = [*sets, ROOM]
     for name in names:
         if name in store:
             continue
-        dataset = sets[name] if name in sets else _render_room(store.folder / "room")
+        if name in sets:
+            dataset = sets[name]
+        else:
+            dataset = _render_room(store.folder / "room", num_survey, num_flight)
         with open_map(store.folder / "maps", name, dataset, model) as reader:
             store[name] = _measure_set(name, dataset, reader, model, others)
     return {"model": model.identity.name, "k": K, "sets": {name: store[name] for name in names}}
@@ -104,12 +113,12 @@ def describe_tiny(image: NDArray[np.uint8]) -> Array32:
     return described
 
 
-def _render_room(folder: Path) -> Dataset:
+def _render_room(folder: Path, num_survey: int, num_flight: int) -> Dataset:
     """Render a survey of a room to map and a flight through it to query."""
     world, images = make_room(ROOM_SEED), {}
     for name, poses, noise_seed in (
-        ("survey", survey_poses(world, NUM_SURVEY, ROOM_SEED), 1000),
-        ("flight", flight_poses(world, NUM_FLIGHT, ROOM_SEED), 5000),
+        ("survey", survey_poses(world, num_survey, ROOM_SEED), 1000),
+        ("flight", flight_poses(world, num_flight, ROOM_SEED), 5000),
     ):
         rendered = render_images(ROOM_SEED, poses, folder / name, noise_seed=noise_seed)
         images[name] = [
@@ -275,7 +284,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
     figure = make_figure(7.0, 5.6)
     grid = figure.add_gridspec(2, 1, height_ratios=(1, 1.1))
     _draw_histograms(figure.add_subfigure(grid[0]), result)
-    _draw_recalled(figure.add_subfigure(grid[1]), result["sets"][ROOM]["shown"])
+    _draw_recalled(figure.add_subfigure(grid[1]), result["sets"][ROOM])
     save_figure(figure, path)
 
 
@@ -298,11 +307,11 @@ def _draw_histograms(figure: SubFigure, result: Mapping[str, Any]) -> None:
     figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
 
 
-def _draw_recalled(figure: SubFigure, shown: Mapping[str, Any]) -> None:
+def _draw_recalled(figure: SubFigure, room: Mapping[str, Any]) -> None:
     """Draw a query of the rendered room, and its images in order: green ones are correct."""
-    world = make_room(ROOM_SEED)
-    query = flight_poses(world, NUM_FLIGHT, ROOM_SEED)[shown["query"]]
-    survey = survey_poses(world, NUM_SURVEY, ROOM_SEED)
+    world, shown = make_room(ROOM_SEED), room["shown"]
+    query = flight_poses(world, room["num_queries"], ROOM_SEED)[shown["query"]]
+    survey = survey_poses(world, room["num_mapped"], ROOM_SEED)
     grid = figure.add_gridspec(1, 2, width_ratios=(1, 2))
     left, right = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
     left.suptitle(f"a query in the {ROOM}", fontsize="small")
