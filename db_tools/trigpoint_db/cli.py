@@ -44,7 +44,8 @@ from trigpoint_db.cli_survey import DensityAngle, DensityText, check_images, rea
 from trigpoint_db.cli_survey import app as survey_app
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.evaluate import evaluate, plot_paths, read_truth
-from trigpoint_db.experiments.cli_scenes import app as experiments
+from trigpoint_db.experiments.cli import app as experiments
+from trigpoint_db.experiments.cli_scenes import app as scenes
 from trigpoint_db.extraction import NetworkFiles, open_crew
 from trigpoint_db.fleet import cli as fleet_cli
 from trigpoint_db.importers import cli as importers_cli
@@ -89,6 +90,7 @@ app.add_typer(importers_cli.app)
 app.add_typer(fleet_cli.app)
 app.add_typer(survey_app)
 app.add_typer(report_app)
+experiments.add_typer(scenes)
 app.add_typer(experiments, name="experiment")
 
 

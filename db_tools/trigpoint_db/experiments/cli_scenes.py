@@ -12,10 +12,12 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.models.retrieval import RetrievalModel
 from trigpoint_db.experiments import recall, scenes
 from trigpoint_db.experiments.benchmarks import read_benchmark
-from trigpoint_db.experiments.cli import DATA, RESULTS, Output, app, publish
+from trigpoint_db.experiments.cli import DATA, RESULTS, Output, publish
 from trigpoint_db.experiments.sets import read_splits
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.terminal import Json, Model, Retrieval
+
+app = typer.Typer()
 
 Root = Annotated[
     Path, typer.Option(metavar="DIR", help="The data set's folder, unpacked as docs/maps.md says.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -115,17 +114,14 @@ def describe_tiny(image: NDArray[np.uint8]) -> Array32:
 
 def _render_room(folder: Path, num_survey: int, num_flight: int) -> Dataset:
     """Render a survey of a room to map and a flight through it to query."""
-    world, images = make_room(ROOM_SEED), {}
-    for name, poses, noise_seed in (
-        ("survey", survey_poses(world, num_survey, ROOM_SEED), 1000),
-        ("flight", flight_poses(world, num_flight, ROOM_SEED), 5000),
-    ):
-        rendered = render_images(ROOM_SEED, poses, folder / name, noise_seed=noise_seed)
-        images[name] = [
-            replace(image, name=f"{name}/{image.name}")
-            for image in track(rendered, f"{ROOM}: {name}", len(poses))
-        ]
-    return Dataset.from_split(folder, images["survey"], images["flight"])
+    world = make_room(ROOM_SEED)
+    poses = [
+        *survey_poses(world, num_survey, ROOM_SEED),
+        *flight_poses(world, num_flight, ROOM_SEED),
+    ]
+    rendered = render_images(ROOM_SEED, Rigid3.stack(poses), folder, noise_seed=1000)
+    images = list(track(rendered, f"{ROOM}: rendering", len(poses)))
+    return Dataset.from_split(folder, images[:num_survey], images[num_survey:])
 
 
 def _measure_set(
