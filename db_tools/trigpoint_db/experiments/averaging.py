@@ -46,7 +46,11 @@ def measure(
 ) -> dict[str, Any]:
     """Measure the errors of each method for the queries of each set."""
     options = LocalizerOptions(num_anchors=num_anchors, num_relative_poses=num_anchors)
-    settings = {"network": network.identity.name, "num_anchors": num_anchors}
+    settings = {
+        "network": network.identity.name,
+        "num_anchors": num_anchors,
+        "max_queries": max_queries,
+    }
     queries = {name: choose(dataset.queries, max_queries) for name, dataset in sets.items()}
     keys = {name: [f"{name}: {query.name}" for query in chosen] for name, chosen in queries.items()}
     store.begin("averaging", settings | {"queries": keys})
@@ -129,7 +133,7 @@ def write_table(result: Mapping[str, Any]) -> str:
     parts = [
         f"{result['num_anchors']} anchors, and a relative pose for each of them; those that agree "
         "on one pose are averaged, by each method the same. Median position errors of the queries "
-        f"with an average; the last row compares them with {OURS}." + describe_choice(rows),
+        f"with an average; the last row compares them with {OURS}." + describe_choice(result),
         markdown(["set", "averaged", *METHODS], cells),
     ]
     compared = [row for row in rows if row["num_averaged"]]
@@ -151,14 +155,11 @@ def write_table(result: Mapping[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def describe_choice(rows: list[Mapping[str, Any]]) -> str:
+def describe_choice(result: Mapping[str, Any]) -> str:
     """Say where only some of the queries were taken."""
-    fewer = [
-        f"{row['num_chosen']} of the {row['num_queries']} queries of {row['set']}"
-        for row in rows
-        if row["num_chosen"] < row["num_queries"]
-    ]
-    return f" Chosen by a fixed seed: {', '.join(fewer)}." if fewer else ""
+    some = any(row["num_chosen"] < row["num_queries"] for row in result["rows"])
+    most = result["max_queries"]
+    return f" At most {most} queries of each set, chosen by a fixed seed." if some else ""
 
 
 def is_better(row: Mapping[str, Any], ours: str, theirs: str) -> bool:
@@ -178,11 +179,11 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
     figure = make_figure(8, 1.5 + 0.35 * len(rows))
     axes = figure.subplots()
     for method, color in COLORS.items():
-        ratios = [ratio(row, method) for row in rows]
-        places = [place for place, value in enumerate(ratios) if value is not None]
+        ratios = [(place, ratio(row, method)) for place, row in enumerate(rows)]
+        known = [(value, place) for place, value in ratios if value is not None]
         axes.plot(
-            [ratios[place] for place in places],
-            places,
+            [value for value, _ in known],
+            [place for _, place in known],
             "|" if method == OURS else "o",
             color=color,
             markersize=12 if method == OURS else 7,

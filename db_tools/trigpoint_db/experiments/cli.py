@@ -11,7 +11,7 @@ import typer
 
 from trigpoint.errors import ConfigError
 from trigpoint.models.features import FeatureModel
-from trigpoint_db.experiments import anchors, averaging, noise
+from trigpoint_db.experiments import ablation, anchors, averaging, noise
 from trigpoint_db.experiments.page import write_page
 from trigpoint_db.experiments.sets import read_scenes, read_splits, read_wholes
 from trigpoint_db.experiments.store import Store
@@ -94,6 +94,24 @@ def anchors_command(
     store, network = Store(output), FeatureModel.load(model)
     result = anchors.measure(dict(wholes[:sets]), network, images, store)
     publish("anchors", anchors, result, store, as_json)
+
+
+@app.command("ablation")
+def ablation_command(
+    data: Annotated[Path, DATA],
+    output: Output = RESULTS,
+    queries: Annotated[int, typer.Option(help="Of each set and split, at the most.", min=1)] = 15,
+    model: Model = "base",
+    fp32: Annotated[
+        Path | None, typer.Option(help="The network in float32 (.onnx), to compare with INT8.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Take back our departures from the paper, one after the other: what each brings."""
+    sets, store, network = read_splits(data), Store(output), FeatureModel.load(model)
+    float_network = None if fp32 is None else FeatureModel.load(str(fp32))
+    result = ablation.measure(sets, network, float_network, queries, store)
+    publish("ablation", ablation, result, store, as_json)
 
 
 @app.command()

@@ -47,7 +47,7 @@ def read_splits(data: Path, pattern: str = "*") -> dict[str, Dataset]:
 def read_wholes(data: Path) -> dict[str, Dataset]:
     """Read the same sets, with all of their images in the map and no queries."""
     return {
-        folder.name: Dataset(folder / "images", read_model(folder / "sparse"))
+        f"{folder.name}, whole": Dataset(folder / "images", read_model(folder / "sparse"))
         for folder in find_sets(data)
     }
 
@@ -86,9 +86,10 @@ def open_map(
     folder: Path, name: str, dataset: Dataset, network: FeatureModel
 ) -> Iterator[MapReader]:
     """Open the map of a data set that is in a folder, or made there; one half made goes on."""
-    path = folder / f"{name.replace(', ', '_')}_{network.identity.name}.tpmap"
+    path = folder / f"{name.replace(', ', '_')}_{network.identity.sha256[:8]}.tpmap"
     if not is_map_of(path, dataset, network):
         folder.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
         images = dataset.mapped
         tracked = track(images, f"{name}: map", len(images))
         build_map(path, tracked, dataset.images, network, resume=True)
