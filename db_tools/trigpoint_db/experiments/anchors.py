@@ -30,6 +30,7 @@ from trigpoint_db.figures import make_figure, save_figure
 from trigpoint_db.importers.base import Dataset
 
 T = TypeVar("T")
+Estimate = tuple[Rigid3, int] | Reason | Result
 
 NUM_ANCHORS = (2, 3, 5, 10, 20, 50, 100, 150)
 LEAST_SQUARES, ROBUST = "stage 1, least squares", "stage 1, robust"
@@ -105,7 +106,7 @@ def sweep(reader: MapReader, network: FeatureModel, index: int) -> list[dict[str
         ms[RELATIVE_POSES] += took
         views = np.append(views, begin + chosen)
         relative = Rigid3(np.append(relative.R, poses.R, 0), np.append(relative.t, poses.t, 0))
-        estimates = {
+        estimates: dict[str, tuple[Estimate, float]] = {
             LEAST_SQUARES: timed(
                 average_poses,
                 query.views[views],
@@ -138,7 +139,7 @@ def timed(function: Callable[..., T], *arguments: Any) -> tuple[T, float]:
     return result, 1e3 * (time.perf_counter() - start)
 
 
-def error_of(estimate: tuple[Rigid3, int] | Reason | Result, truth: Rigid3) -> float | None:
+def error_of(estimate: Estimate, truth: Rigid3) -> float | None:
     """Return the distance of the centers; None without a pose."""
     if isinstance(estimate, Reason | Lost):
         return None
