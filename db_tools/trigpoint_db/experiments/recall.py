@@ -115,11 +115,10 @@ def describe_tiny(image: NDArray[np.uint8]) -> Array32:
 def _render_room(folder: Path, num_survey: int, num_flight: int) -> Dataset:
     """Render a survey of a room to map and a flight through it to query."""
     world = make_room(ROOM_SEED)
-    poses = [
-        *survey_poses(world, num_survey, ROOM_SEED),
-        *flight_poses(world, num_flight, ROOM_SEED),
-    ]
-    rendered = render_images(ROOM_SEED, Rigid3.stack(poses), folder, noise_seed=1000)
+    survey = survey_poses(world, num_survey, ROOM_SEED)
+    flight = flight_poses(world, num_flight, ROOM_SEED)
+    poses = Rigid3(np.concatenate([survey.R, flight.R]), np.concatenate([survey.t, flight.t]))
+    rendered = render_images(ROOM_SEED, poses, folder, noise_seed=1000)
     images = list(track(rendered, f"{ROOM}: rendering", len(poses)))
     return Dataset.from_split(folder, images[:num_survey], images[num_survey:])
 
