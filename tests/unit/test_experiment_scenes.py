@@ -110,6 +110,7 @@ def test_aachen_is_written_for_submission(
     for name, cam_from_world in submitted.items():
         assert cam_from_world.center == pytest.approx(queries[name].cam_from_world.center, abs=0.05)
     assert "The true poses of 3 of the 3 queries are not public" in out
+    assert "The paper counts 4,328 reference images, and 3 are mapped here" in out
 
 
 def test_robotcar_is_judged_where_a_pose_is_public(run: Run, tmp_path: Path) -> None:
@@ -123,6 +124,7 @@ def test_robotcar_is_judged_where_a_pose_is_public(run: Run, tmp_path: Path) -> 
     assert [parts[time]["num_judged"] for time in ("Day", "Night")] == [1, 0]
     assert parts["Day"]["recalls"] == [1.0, 1.0, 1.0]
     assert rows_of(out, "**Trigpoint**")[0][2:] == ["100.0/100.0/100.0", "-"]
+    assert "Ours is judged on the 1 queries with a public pose" in out
     assert "rear/1418721355046418.jpg" in read_poses(tmp_path / "robotcar_submission.txt")
 
 

@@ -61,6 +61,13 @@ def test_every_number_is_that_of_the_source(label: str, names: tuple[str, ...]) 
             assert part.group == (group if has_groups else None)
 
 
+def test_the_sizes_of_the_data_sets_are_those_of_the_source() -> None:
+    counted = re.findall(r"contains ([\d,]+) reference images", read_source())
+    tables = load_published()
+    names = ("7scenes", "cambridge", "aachen", "robotcar")  # in the order of the text
+    assert [tables[name].num_references for name in names] == counted
+
+
 def test_tables_are_whole_without_the_source() -> None:
     tables = load_published()
     assert set(tables) == {name for names in PARTS.values() for name in names}

@@ -46,9 +46,9 @@ class PublishedRow:
 class PublishedTable:
     """One data set's part of a table: `label` is the table's, in the paper's source."""
 
-    paper: str
     label: str
     cells: str  # what the cells hold, with units
+    num_references: str | None  # images to map that the paper counts in the data set
     columns: tuple[str, ...]
     rows: tuple[PublishedRow, ...]
 
@@ -77,9 +77,9 @@ def load_published() -> dict[str, PublishedTable]:
     content: dict[str, Any] = json.loads(text)
     return {
         name: PublishedTable(
-            content["paper"],
             table["label"],
             table["cells"],
+            table["num_references"],
             tuple(table["columns"]),
             tuple(_make_row(**row) for row in table["rows"]),
         )
