@@ -18,6 +18,7 @@ SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
 .PHONY: demo test kill-test test-oak test-systemd test-v4l2 check golden
 .PHONY: bench bench-building bench-models bench-localizer bench-daemon bench-maps soak wheel-test clean
+.PHONY: experiments
 .PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
@@ -113,6 +114,18 @@ soak: $(READY) $(DEMO)/map.tpmap
 
 $(DEMO)/map.tpmap: | $(READY)
 	$(BIN)/trigpoint-db demo $(DEMO)
+
+# The paper's experiments, as far as they need no public data set, and docs/experiments.md; about
+# 20 minutes. What is interrupted goes on. FP32=build/fp32/base.fp32.onnx compares with INT8.
+EXPERIMENTS := build/experiments
+experiments: $(READY)
+	$(BIN)/trigpoint-db experiment noise --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment averaging --data $(DATA) --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment anchors --data $(DATA) --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment ablation --data $(DATA) --output $(EXPERIMENTS) \
+	  $(if $(FP32),--fp32 '$(FP32)') >/dev/null
+	$(BIN)/trigpoint-db experiment page $(EXPERIMENTS) docs
+	rm -rf $(EXPERIMENTS)/maps # the next run measures anew
 
 # Profiles of maps, and retrieval in maps of up to a million images; half an hour and 2 GB.
 bench-maps: $(READY)
