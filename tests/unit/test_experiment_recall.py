@@ -97,7 +97,7 @@ def measured(
     adapt_model(source, folder / "places.onnx", fields)
     external = RetrievalModel.load(folder / "places.onnx")
     store = Store(folder)
-    result = recall.measure({}, tiny, external, store, num_survey=24, num_flight=2)
+    result = recall.measure({}, tiny, external, 20, 100, store, num_survey=24, num_flight=2)
     return result, store.write("recall", result)
 
 
@@ -143,10 +143,19 @@ def test_what_is_said_of_the_paper_follows_from_the_numbers(
         CHANCE: {"recalls": [0.1] * 4, "share": 0.1},
     }
     measured = {"num_mapped": 40, "num_queries": 10, "methods": methods}
-    table = recall.write_table({"model": "x", "k": 20, "sets": {"a": measured}})
+    table = recall.write_table(
+        {"model": "x", "num_anchors": 20, "num_queries": 9, "sets": {"a": measured}}
+    )
     assert f"more than half are correct in {mostly}" in table
     assert f"what lacks is {lacks}" in table
     assert f"{TINY} 75.0 and 10.0; {PACKAGED} 50.0 and {100 * share:.1f}" in table
+
+
+def test_images_are_ranked_by_likeness_and_apart_from_those_before_where_asked() -> None:
+    images = np.array([[0.6, 0.8], [1, 0], [0.99, 0.14], [0, 1]], np.float32)
+    query = np.array([[0.95, 0.31]], np.float32)
+    np.testing.assert_array_equal(recall._rank(query, images, 3), [[2, 1, 0]])
+    np.testing.assert_array_equal(recall._rank(query, images, 3, 0.8), [[2, 0, 1]])
 
 
 def test_chance_is_that_of_drawing_without_returning() -> None:

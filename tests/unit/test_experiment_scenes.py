@@ -12,22 +12,18 @@ import pytest
 
 from tests.unit.conftest import Run
 from tests.unit.layouts import (
-    KINECT,
-    POSES,
     View,
-    take,
     write_cambridge,
     write_pseudo_truth,
     write_robotcar,
     write_seven_scenes,
 )
+from tests.unit.posed_sets import write_set
 from trigpoint.models.features import FeatureModel
 from trigpoint_db.experiments.benchmarks import read_benchmark
 from trigpoint_db.experiments.scenes import draw, measure, write_table
 from trigpoint_db.experiments.store import Store, read_result
-from trigpoint_db.importers.base import PosedImage
-from trigpoint_db.importers.colmap import write_model
-from trigpoint_db.poses import Query, read_poses, write_queries
+from trigpoint_db.poses import read_poses
 
 draws = pytest.mark.skipif(find_spec("matplotlib") is None, reason="needs trigpoint[plots]")
 pytestmark = draws  # every command draws what it has measured
@@ -129,17 +125,7 @@ def test_robotcar_is_judged_where_a_pose_is_public(run: Run, tmp_path: Path) -> 
 
 
 def test_a_sequence_of_redkitchen_is_split_in_two_ways(run: Run, tmp_path: Path) -> None:
-    folder = tmp_path / "data" / "7scenes_redkitchen"
-    images = [PosedImage(f"{i}.png", KINECT, POSES[i]) for i in range(len(POSES))]
-    for image in images:
-        take(folder / "images" / image.name, KINECT, image.cam_from_world)
-    write_model(folder / "sparse", images)
-    for suffix, held_out in (("", images[::3]), ("_block", images[4:])):
-        mapped = [image.name for image in images if image not in held_out]
-        (folder / f"map{suffix}.txt").write_text("\n".join(mapped) + "\n")
-        write_queries(
-            folder / f"queries{suffix}.txt", [Query(image.name, KINECT) for image in held_out]
-        )
+    write_set(tmp_path / "data" / "7scenes_redkitchen", 10)
     code, out, err = run(
         "experiment", "redkitchen", "--data", tmp_path / "data", "--output", tmp_path,
         "--model", "tiny",

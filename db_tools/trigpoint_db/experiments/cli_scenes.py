@@ -12,8 +12,8 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.models.retrieval import RetrievalModel
 from trigpoint_db.experiments import recall, scenes
 from trigpoint_db.experiments.benchmarks import read_benchmark
-from trigpoint_db.experiments.cli import DATA, RESULTS, Output, publish
-from trigpoint_db.experiments.sets import read_splits
+from trigpoint_db.experiments.cli import DATA, RESULTS, ROOT, Output, publish
+from trigpoint_db.experiments.sets import read_scenes, read_splits
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.terminal import Json, Model, Retrieval
 
@@ -113,17 +113,21 @@ def _measure(
 @app.command("recall")
 def recall_command(
     data: Annotated[Path | None, DATA] = None,
+    root: Annotated[Path | None, ROOT] = None,
     output: Output = RESULTS,
+    anchors: Anchors = 20,
+    queries: Annotated[int, typer.Option(help="Of each set, at the most.", min=1)] = 100,
     model: Model = "base",
     retrieval: Annotated[
         Path | None, typer.Option(help="Another retrieval network, to compare with.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Count the retrieved images that see what the query sees, in a rendered room and in DATA."""
+    """Count the retrieved images that see what the query sees, in a rendered room and elsewhere."""
     splits = {} if data is None else read_splits(data)
     sets = {name: dataset for name, dataset in splits.items() if name.endswith("block")}
+    sets |= {} if root is None else read_scenes(root)
     external = None if retrieval is None else RetrievalModel.load(retrieval)
-    store = Store(output)
-    result = recall.measure(sets, FeatureModel.load(model), external, store)
+    store, network = Store(output), FeatureModel.load(model)
+    result = recall.measure(sets, network, external, anchors, queries, store)
     publish("recall", recall, result, store, as_json)

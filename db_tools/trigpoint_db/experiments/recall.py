@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
 from trigpoint_db.build import read_frame
 from trigpoint_db.demo import render_images
-from trigpoint_db.experiments.sets import open_map
+from trigpoint_db.experiments.sets import choose, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import markdown
 from trigpoint_db.experiments.visibility import MAX_PARALLAX_DEG, MIN_OVERLAP, find_overlapping
@@ -40,7 +41,6 @@ Truth = NDArray[np.bool_]
 Describe = Callable[[NDArray[np.uint8]], Array32]
 
 RANKS = (1, 5, 10, 20)
-K = RANKS[-1]
 NUM_BINS = 10
 TINY_PX = 16
 
@@ -61,6 +61,8 @@ def measure(
     sets: Mapping[str, Dataset],
     model: FeatureModel,
     external: RetrievalModel | None,
+    num_anchors: int,
+    num_queries: int,
     store: Store,
     *,
     num_survey: int = 140,
@@ -76,6 +78,10 @@ def measure(
         Gives the packaged descriptor.
     external : RetrievalModel, optional
         Gives another one to compare with; tiny images do so in any case.
+    num_anchors : int
+        How many images are retrieved.
+    num_queries : int
+        Of each set, at the most.
     store : Store
     num_survey, num_flight : int
         Mapped images of the rendered room, and queries there.
@@ -86,6 +92,8 @@ def measure(
     settings = {
         "model": model.identity.sha256,
         "others": list(others),
+        "num_anchors": num_anchors,
+        "num_queries": num_queries,
         "sets": {name: len(dataset.queries) for name, dataset in sets.items()},
         "room": [num_survey, num_flight],
     }
@@ -98,9 +106,15 @@ def measure(
             dataset = sets[name]
         else:
             dataset = _render_room(store.folder / "room", num_survey, num_flight)
+        asked = replace(dataset, queries=choose(dataset.queries, num_queries))
         with open_map(store.folder / "maps", name, dataset, model) as reader:
-            store[name] = _measure_set(name, dataset, reader, model, others)
-    return {"model": model.identity.name, "k": K, "sets": {name: store[name] for name in names}}
+            store[name] = _measure_set(name, asked, reader, model, others, num_anchors)
+    return {
+        "model": model.identity.name,
+        "num_anchors": num_anchors,
+        "num_queries": num_queries,
+        "sets": {name: store[name] for name in names},
+    }
 
 
 def describe_tiny(image: NDArray[np.uint8]) -> Array32:
@@ -129,6 +143,7 @@ def _measure_set(
     reader: MapReader,
     model: FeatureModel,
     others: Mapping[str, Describe],
+    num_anchors: int,
 ) -> dict[str, Any]:
     """Rank the images of a map for all queries, and count those that see the same."""
     asked: dict[str, list[Array32]] = {method: [] for method in (PACKAGED, *others)}
@@ -154,18 +169,22 @@ def _measure_set(
         },
     }
     orders = {
-        method: _rank(np.stack(asked[method]), np.stack(mapped[method]), diversity=0.0)
+        method: _rank(np.stack(asked[method]), np.stack(mapped[method]), num_anchors)
         for method in asked
     }
-    diversity = LocalizerOptions().anchor_diversity
-    orders[DIVERSE] = _rank(np.stack(asked[PACKAGED]), np.stack(mapped[PACKAGED]), diversity)
+    orders[DIVERSE] = _rank(
+        np.stack(asked[PACKAGED]),
+        np.stack(mapped[PACKAGED]),
+        num_anchors,
+        LocalizerOptions().anchor_diversity,
+    )
     shown = int(np.argmax(is_correct.sum(axis=1)))
     images = orders[PACKAGED][shown]
     return {
         "num_mapped": len(reader),
         "num_queries": len(queries),
         "methods": {
-            POSSIBLE: _describe_best(is_correct),
+            POSSIBLE: _describe_best(is_correct, num_anchors),
             **{method: _describe_order(orders[method], is_correct) for method in sorted(orders)},
             CHANCE: _describe_chance(is_correct),
         },
@@ -177,18 +196,18 @@ def _measure_set(
     }
 
 
-def _rank(queries: Array32, images: Array32, diversity: float) -> Indices:
-    """Return for queries (Q, G) which K of the images (N, G) are most alike, best first."""
+def _rank(queries: Array32, images: Array32, k: int, diversity: float = 0.0) -> Indices:
+    """Return for queries (Q, G) which k of the images (N, G) are most alike, best first."""
     orders = []
     for similarities in queries @ images.T:
-        pool = find_largest(similarities, POOL * K)
+        pool = find_largest(similarities, POOL * k)
         alike = images[pool] @ images[pool].T
-        orders.append(pool[choose_diverse(similarities[pool], alike, K, diversity)])
+        orders.append(pool[choose_diverse(similarities[pool], alike, k, diversity)])
     return np.stack(orders)
 
 
 def _describe_order(order: Indices, is_correct: Truth) -> dict[str, Any]:
-    """Describe orders (Q, K) of images: how often one of the first is correct, how many are."""
+    """Describe orders (Q, k) of images: how often one of the first is correct, how many are."""
     found = np.take_along_axis(is_correct, order, axis=1)
     shares = found.mean(axis=1)
     return {
@@ -198,9 +217,9 @@ def _describe_order(order: Indices, is_correct: Truth) -> dict[str, Any]:
     }
 
 
-def _describe_best(is_correct: Truth) -> dict[str, Any]:
+def _describe_best(is_correct: Truth, k: int) -> dict[str, Any]:
     """Describe what an order could have at best, with the correct images that the map has."""
-    best = np.argsort(~is_correct, axis=1, kind="stable")[:, :K]
+    best = np.argsort(~is_correct, axis=1, kind="stable")[:, :k]
     return _describe_order(best, is_correct)
 
 
@@ -223,18 +242,24 @@ def write_table(result: Mapping[str, Any]) -> str:
         for name, measured in result["sets"].items()
         for method, found in measured["methods"].items()
     ]
-    header = ["set", "images", *(f"top {rank}" for rank in RANKS), f"correct of {result['k']}"]
+    header = [
+        "set",
+        "images",
+        *(f"top {rank}" for rank in RANKS),
+        f"correct of {result['num_anchors']}",
+    ]
     sizes = ", ".join(
         f"{name} {measured['num_queries']} of {measured['num_mapped']}"
         for name, measured in result["sets"].items()
     )
+    k, most = result["num_anchors"], result["num_queries"]
     introduction = (
-        "Share of the queries (%) with a correct image among the first, and how many of "
-        f"{result['k']}, or of all in a smaller map, are correct (%, mean). An image is correct "
-        f"that sees at least {MIN_OVERLAP:.0%} of what the query sees, from the true poses and the "
-        "query's median depth (the overlap of frusta of RelocNet, Balntas et al. 2018), under a "
-        f"parallax of {MAX_PARALLAX_DEG:.0f} degrees at most. Network `{result['model']}`. Queries "
-        f"and mapped images: {sizes}."
+        f"Share of the queries (%) with a correct image among the first, and how many of {k}, or "
+        "of all in a smaller map, are correct (%, mean). An image is correct that sees at least "
+        f"{MIN_OVERLAP:.0%} of what the query sees, from the true poses and the query's median "
+        "depth (the overlap of frusta of RelocNet, Balntas et al. 2018), under a parallax of "
+        f"{MAX_PARALLAX_DEG:.0f} degrees at most. Network `{result['model']}`. Queries, {most} of "
+        f"a set at the most, by a fixed seed, and mapped images: {sizes}."
     )
     return "\n\n".join([introduction, markdown(header, rows, num_words=2), *_conclude(result)])
 
@@ -262,7 +287,7 @@ def _conclude(result: Mapping[str, Any]) -> list[str]:
     return [
         (
             "Over all queries, the first image is correct, and of the first "
-            f"{result['k']} are, in %: {compared}."
+            f"{result['num_anchors']} are, in %: {compared}."
         ),
         (
             "The paper says that the vast majority of the recalled images are near the query, but "
@@ -296,7 +321,9 @@ def _draw_histograms(figure: SubFigure, result: Mapping[str, Any]) -> None:
             axes.stairs(heights, edges, color=color, fill=method == POSSIBLE, label=method)
         axes.axvline(100 * methods[CHANCE]["share"], color="crimson", ls=":", label=CHANCE)
         axes.set_title(name, fontsize="small")
-    figure.supxlabel(f"correct images among the first {result['k']} (%)", fontsize="small")
+    figure.supxlabel(
+        f"correct images among the first {result['num_anchors']} (%)", fontsize="small"
+    )
     figure.supylabel("queries (%)", fontsize="small")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
