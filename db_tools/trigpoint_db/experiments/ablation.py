@@ -25,7 +25,7 @@ from trigpoint_db.experiments.averaging import describe_choice
 from trigpoint_db.experiments.sets import choose, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import geometric_mean, markdown, median, number
-from trigpoint_db.figures import make_figure, save_figure
+from trigpoint_db.figures import label_plainly, make_figure, save_figure
 from trigpoint_db.importers.base import Dataset
 
 
@@ -250,6 +250,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
     axes.set_yticks(range(len(variants)), variants)
     axes.invert_yaxis()
     axes.set_xscale("log")
+    label_plainly(axes.xaxis)
     axes.set_xlabel("median position error over that of the localizer as it is, each set a dot")
     axes.grid(axis="x", which="both", alpha=0.3)
     save_figure(figure, path)

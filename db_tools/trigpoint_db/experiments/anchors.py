@@ -7,7 +7,7 @@ the paper each anchor has a relative pose, for stage 1, and matches, for the fin
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +26,7 @@ from trigpoint.stages import Query, average_poses, estimate_relative_poses, matc
 from trigpoint_db.experiments.sets import choose, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import markdown, median, number
-from trigpoint_db.figures import make_figure, save_figure
+from trigpoint_db.figures import label_plainly, make_figure, save_figure
 from trigpoint_db.importers.base import Dataset
 
 T = TypeVar("T")
@@ -189,7 +189,7 @@ def write_table(result: Mapping[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def describe_gain(rows: list[Mapping[str, Any]], label: str) -> str:
+def describe_gain(rows: Sequence[Mapping[str, Any]], label: str) -> str:
     """Say where the error is least, and what the anchors beyond 20 bring."""
     errors = {
         row["num_anchors"]: row["medians"][label]
@@ -225,10 +225,10 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
         )
         top.set_title(name, fontsize="medium")
         top.set_yscale("log")
+        label_plainly(top.yaxis)
         for axes in (top, bottom):
             axes.set_xscale("log")
-            axes.set_xticks(numbers, [str(number) for number in numbers], minor=False)
-            axes.minorticks_off()
+            label_plainly(axes.xaxis)
             axes.grid(alpha=0.3)
     panels[0][0].set_ylabel("median position error")
     panels[1][0].set_ylabel("ms, stage upon stage")

@@ -23,7 +23,7 @@ from trigpoint_db.experiments.noise import COLORS, DUELS, METHODS, OURS, estimat
 from trigpoint_db.experiments.sets import choose, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import geometric_mean, markdown, median, number
-from trigpoint_db.figures import make_figure, save_figure
+from trigpoint_db.figures import label_plainly, make_figure, save_figure
 from trigpoint_db.importers.base import Dataset
 from trigpoint_db.poses import Query
 
@@ -192,9 +192,10 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
     axes.set_yticks(range(len(rows)), [row["set"] for row in rows])
     axes.invert_yaxis()
     axes.set_xscale("log")
+    label_plainly(axes.xaxis)
     axes.set_xlabel(f"median position error, over that of {OURS}")
     axes.grid(axis="x", which="both", alpha=0.3)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=len(METHODS))
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     save_figure(figure, path)
 
 

@@ -224,7 +224,7 @@ def compare(levels: Sequence[Mapping[str, Mapping[str, float]]], ours: str, thei
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
     """Draw a panel for each kind of noise: medians with their confidence intervals."""
-    figure = make_figure(9, 8)
+    figure = make_figure(8, 7)
     panels = figure.subplots(len(SETUPS), len(NOISES), sharex=True, sharey="row")
     for axes_row, (perturbed, origin) in zip(panels, SETUPS, strict=True):
         for axes, noise in zip(axes_row, NOISES, strict=True):
@@ -238,14 +238,12 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
                 style = "--" if method == CLOSED_FORM else "-"  # which hides what it equals
                 axes.plot(noise_deg, median, style, color=color, marker=".", label=method)
                 axes.fill_between(noise_deg, low, high, color=color, alpha=0.2, linewidth=0)
-            axes.set_title(f"{perturbed}, origin {origin:g}: {noise}", fontsize="medium")
+            axes.set_title(f"{perturbed}, origin {origin:g}: {noise}", fontsize="small")
             axes.grid(alpha=0.3)
         axes_row[0].set_ylim(bottom=0)
     figure.supxlabel("noise (degrees, standard deviation about each axis)")
     figure.supylabel("median position error (% of the anchors' distance)")
-    figure.legend(
-        *panels[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=len(METHODS)
-    )
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     save_figure(figure, path)
 
 

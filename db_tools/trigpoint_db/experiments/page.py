@@ -27,6 +27,7 @@ SECTIONS = {
     "recall": ("Retrieval", "recall"),
     "ablation": ("What each departure from the paper brings", "ablation"),
 }
+NUM_COLORS = 64
 INTRODUCTION = """# The paper's experiments
 
 What *Multiview Image-Based Localization* measures, measured again, beside the numbers that it
@@ -71,6 +72,7 @@ def write_section(name: str, result: Mapping[str, Any], pictures: Path) -> str:
     experiment = import_module(f"trigpoint_db.experiments.{module}")
     picture = pictures / f"{name}.png"
     experiment.draw(result, picture)
+    shrink(picture)
     return "\n\n".join(
         [
             f"## {title}",
@@ -79,6 +81,15 @@ def write_section(name: str, result: Mapping[str, Any], pictures: Path) -> str:
             f"<sub>{describe_machine(result['machine'])}</sub>",
         ]
     )
+
+
+def shrink(picture: Path) -> None:
+    """Give a drawing a palette: a third of the size, and no difference that is seen."""
+    from PIL import Image  # comes with matplotlib, an extra
+
+    with Image.open(picture) as image:
+        drawn = image.convert("RGB").quantize(NUM_COLORS)
+    drawn.save(picture, optimize=True)
 
 
 def describe_machine(machine: Mapping[str, Any]) -> str:
