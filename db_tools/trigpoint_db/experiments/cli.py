@@ -15,6 +15,7 @@ from trigpoint_db.experiments import ablation, anchors, averaging, noise
 from trigpoint_db.experiments.page import write_page
 from trigpoint_db.experiments.sets import read_scenes, read_splits, read_wholes
 from trigpoint_db.experiments.store import Store
+from trigpoint_db.figures import make_figure
 from trigpoint_db.terminal import Json, Model
 
 app = typer.Typer(help="The paper's experiments: measure, and write tables and pictures.")
@@ -41,6 +42,12 @@ class Experiment(Protocol):
         """Draw it."""
 
 
+def open_store(output: Path) -> Store:
+    """Open the folder of the results; without matplotlib, say so before the work and not after."""
+    make_figure(1, 1)
+    return Store(output)
+
+
 def publish(
     name: str, experiment: Experiment, result: Mapping[str, Any], store: Store, as_json: bool
 ) -> None:
@@ -57,7 +64,7 @@ def noise_command(
     as_json: Json = False,
 ) -> None:
     """Synthetic cameras: how center and translation averaging stand noise (the paper's figure)."""
-    store = Store(output)
+    store = open_store(output)
     publish("noise", noise, noise.measure(trials, store), store, as_json)
 
 
@@ -75,7 +82,7 @@ def averaging_command(
     if data is None and root is None:
         raise ConfigError("there is nothing to measure on: give --data or --root")
     sets = ({} if data is None else read_splits(data)) | ({} if root is None else read_scenes(root))
-    store, network = Store(output), FeatureModel.load(model)
+    store, network = open_store(output), FeatureModel.load(model)
     result = averaging.measure(sets, network, num_anchors, queries, store)
     publish("averaging", averaging, result, store, as_json)
 
@@ -91,7 +98,7 @@ def anchors_command(
 ) -> None:
     """Error and time by the number of anchors, from 2 to 150 (the paper's figure "ksweep")."""
     wholes = sorted(read_wholes(data).items(), key=lambda item: -len(item[1].mapped))
-    store, network = Store(output), FeatureModel.load(model)
+    store, network = open_store(output), FeatureModel.load(model)
     result = anchors.measure(dict(wholes[:sets]), network, images, store)
     publish("anchors", anchors, result, store, as_json)
 
@@ -108,7 +115,7 @@ def ablation_command(
     as_json: Json = False,
 ) -> None:
     """Take back our departures from the paper, one after the other: what each brings."""
-    sets, store, network = read_splits(data), Store(output), FeatureModel.load(model)
+    sets, store, network = read_splits(data), open_store(output), FeatureModel.load(model)
     float_network = None if fp32 is None else FeatureModel.load(str(fp32))
     result = ablation.measure(sets, network, float_network, queries, store)
     publish("ablation", ablation, result, store, as_json)
