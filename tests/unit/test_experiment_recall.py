@@ -20,6 +20,7 @@ from trigpoint.rigid import Rigid3
 from trigpoint_db.adapt import adapt_model
 from trigpoint_db.build import build_map, read_frame
 from trigpoint_db.experiments import recall
+from trigpoint_db.experiments.page import shrink
 from trigpoint_db.experiments.recall import CHANCE, DIVERSE, PACKAGED, POSSIBLE, ROOM, TINY
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.visibility import find_overlapping
@@ -125,6 +126,7 @@ def test_the_table_has_all_methods_and_the_picture_is_small(
         pytest.skip("needs trigpoint[plots]")
     picture = path.with_suffix(".png")
     recall.draw(result, picture)
+    shrink(picture)
     assert 0 < picture.stat().st_size < 150_000
 
 

@@ -12,9 +12,8 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.models.retrieval import RetrievalModel
 from trigpoint_db.experiments import recall, scenes
 from trigpoint_db.experiments.benchmarks import read_benchmark
-from trigpoint_db.experiments.cli import DATA, RESULTS, ROOT, Output, publish
+from trigpoint_db.experiments.cli import DATA, RESULTS, ROOT, Output, open_store, publish
 from trigpoint_db.experiments.sets import read_scenes, read_splits
-from trigpoint_db.experiments.store import Store
 from trigpoint_db.terminal import Json, Model, Retrieval
 
 app = typer.Typer()
@@ -105,7 +104,7 @@ def _measure(
     retrieval: Path | None,
     as_json: bool,
 ) -> None:
-    found, store = read_benchmark(name, root, names), Store(output)
+    found, store = read_benchmark(name, root, names), open_store(output)
     network = FeatureModel.load(model, retrieval=retrieval)
     publish(name, scenes, scenes.measure(name, found, network, anchors, store), store, as_json)
 
@@ -128,6 +127,6 @@ def recall_command(
     sets = {name: dataset for name, dataset in splits.items() if name.endswith("block")}
     sets |= {} if root is None else read_scenes(root)
     external = None if retrieval is None else RetrievalModel.load(retrieval)
-    store, network = Store(output), FeatureModel.load(model)
+    store, network = open_store(output), FeatureModel.load(model)
     result = recall.measure(sets, network, external, anchors, queries, store)
     publish("recall", recall, result, store, as_json)

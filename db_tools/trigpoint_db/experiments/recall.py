@@ -53,8 +53,7 @@ CHANCE = "at random"
 ROOM = "rendered room"
 ROOM_SEED = 0
 SHOWN_ROWS, SHOWN_COLUMNS = 4, 5
-THUMBNAIL = Camera("PINHOLE", 120, 90, (86.0, 86.0, 59.5, 44.5))
-GRAY_STEP = 24  # few levels, for a small file
+THUMBNAIL = Camera("PINHOLE", 96, 72, (69.0, 69.0, 47.5, 35.5))
 
 
 def measure(
@@ -346,7 +345,6 @@ def _draw_recalled(figure: SubFigure, room: Mapping[str, Any]) -> None:
 
 def _draw_view(axes: Axes, world: World, cam_from_world: Rigid3, color: str) -> None:
     image = render(world, THUMBNAIL, cam_from_world, seed=None)
-    levels = image // GRAY_STEP * GRAY_STEP
-    axes.imshow(levels, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+    axes.imshow(image, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
     axes.set(xticks=(), yticks=())
     axes.spines[:].set(color=color, linewidth=2)

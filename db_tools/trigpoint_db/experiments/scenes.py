@@ -17,24 +17,13 @@ from trigpoint.rigid import Rigid3
 from trigpoint_db.evaluate import THRESHOLDS, evaluate
 from trigpoint_db.experiments.benchmarks import BENCHMARKS, Scene
 from trigpoint_db.experiments.published import PublishedRow, PublishedTable, load_published
+from trigpoint_db.experiments.scene_notes import write_notes
 from trigpoint_db.experiments.sets import open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import markdown
-from trigpoint_db.figures import make_figure, save_figure
+from trigpoint_db.figures import label_plainly, make_figure, save_figure
 from trigpoint_db.localize import localize_images
 from trigpoint_db.submit import write_submission
-
-SEVEN_SCENES_NOTE = (
-    "The paper does not say by which poses of 7-Scenes it maps and judges: those by KinectFusion, "
-    "the data set's own, or the pseudo ground truth by structure from motion (SfM) of Brachmann et "
-    "al., ICCV 2021. Ours maps and judges by the same."
-)
-KITCHEN_NOTE = (
-    "Ours is one sequence, seq-01, of which every seventh frame is there, with poses by structure "
-    "from motion, and split by us: every fifth image held out, or whole stretches. The benchmark "
-    "localizes other sequences than those that it maps, so ours are no rows of it, and do not say "
-    "who is better."
-)
 
 
 def measure(
@@ -146,7 +135,8 @@ def write_table(result: Mapping[str, Any]) -> str:
             introduction,
             markdown(["", "pipeline", *columns], rows, num_words=2),
             _write_details(result),
-            *_notes(result, table),
+            *write_notes(result, table),
+            *_compare(result, table),
         ]
     )
 
@@ -205,71 +195,10 @@ def _write_details(result: Mapping[str, Any]) -> str:
     return markdown([*header, "median deg", "median m", *levels], rows)
 
 
-def _notes(result: Mapping[str, Any], table: PublishedTable) -> list[str]:
-    """Say what has to be known to read the table; what is claimed follows from its numbers."""
-    notes = {
-        "7scenes": [SEVEN_SCENES_NOTE, _repeats_note(table)],
-        "cambridge": [_scale_note()],
-        "aachen": [_submission_note(result, table)],
-        "robotcar": [_submission_note(result, table)],
-        "redkitchen": [KITCHEN_NOTE],
-    }[result["benchmark"]]
-    if result["benchmark"] in ("7scenes", "cambridge"):
-        notes.append(_comparison(result, table))
-    return [note for note in notes if note]
-
-
-def _repeats_note(table: PublishedTable) -> str:
-    return " ".join(
-        f"The published rows of {a} and {b} have the same numbers for {', '.join(columns)}: one of "
-        "them may be a copy."
-        for a, b, columns in table.repeated_cells()
-    )
-
-
-def _scale_note() -> str:
-    """Say what the paper says of Cambridge's scale, and what its numbers do."""
-    falls = []
-    for name in ("cambridge", "7scenes"):
-        table = load_published()[name]
-        average = table.columns.index("Average")
-        plain, better = (table.row(title).numbers(average) for title in ("HLoc", "HLoc + SG"))
-        assert plain is not None
-        assert better is not None
-        falls.append([a / b for a, b in zip(plain, better, strict=True)])
-    (deg, m), (deg_7, m_7) = falls
-    return (
-        "Scale: the caption of the paper's table says degrees/metres for both data sets, its text "
-        "calls Cambridge's a much larger metric scale, and neither names a factor. Ours is the "
-        "data set's own: positions as they stand in `dataset_train.txt` and `dataset_test.txt`, in "
-        f"metres. From the row HLoc to HLoc + SG the printed average falls by a factor of {m:.1f} "
-        f"in metres and {deg:.1f} in degrees here, and {m_7:.1f} and {deg_7:.1f} on 7-Scenes. "
-        + (
-            "A factor of scale would leave the degrees as they are, so it does not explain that."
-            if deg > 1.5
-            else "Degrees are nearly the same, so the metres may be scaled."
-        )
-    )
-
-
-def _submission_note(result: Mapping[str, Any], table: PublishedTable) -> str:
-    judged = sum(part["num_judged"] for part in result["parts"])
-    total = sum(part["num_queries"] for part in result["parts"])
-    public = (
-        f"Ours is judged on the {judged} queries with a public pose, which are not those that the "
-        "rows above are of. "
-    )
-    return public * bool(judged) + (
-        f"The true poses of {total - judged} of the {total} queries are not public: the file "
-        f"`{result['benchmark']}_submission.txt` beside this result is for "
-        "https://www.visuallocalization.net to judge, and how many were localized is an upper "
-        f"bound of each share. The paper counts {table.num_references} reference images, and "
-        f"{result['parts'][0]['num_mapped']:,} are mapped here."
-    )
-
-
-def _comparison(result: Mapping[str, Any], table: PublishedTable) -> str:
+def _compare(result: Mapping[str, Any], table: PublishedTable) -> list[str]:
     """Count the scenes in which ours is below what is printed for the paper."""
+    if "Average" not in table.columns or result["benchmark"] == "redkitchen":
+        return []
     paper, sentences = table.row("Ours"), []
     for variant in dict.fromkeys(part["variant"] for part in result["parts"]):
         parts = [part for part in result["parts"] if part["variant"] == variant]
@@ -284,7 +213,7 @@ def _comparison(result: Mapping[str, Any], table: PublishedTable) -> str:
             f"{label} is below the paper's printed median in {below[1]} of {len(parts)} scenes in "
             f"metres and {below[0]} in degrees."
         )
-    return " ".join(sentences)
+    return [" ".join(sentences)]
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
@@ -315,6 +244,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
             axes.set_xlim(-3, 103)
         else:
             axes.set_xscale("log")
+            label_plainly(axes.xaxis)
         axes.set_xlabel(quantity)
         axes.grid(color="0.5", alpha=0.2)
         axes.axhline(sum(row in table.rows for row in rows) - 0.5, color="0.5", linewidth=0.8)
