@@ -116,14 +116,15 @@ $(DEMO)/map.tpmap: | $(READY)
 	$(BIN)/trigpoint-db demo $(DEMO)
 
 # The paper's experiments, as far as they need no public data set, and docs/experiments.md; about
-# 20 minutes. What is interrupted goes on. FP32=build/fp32/base.fp32.onnx compares with INT8.
+# 20 minutes. What is interrupted goes on. INT8 is compared with FP32 where that network is.
 EXPERIMENTS := build/experiments
+FLOAT = $(or $(FP32),$(wildcard build/fp32))
 experiments: $(READY)
 	$(BIN)/trigpoint-db experiment noise --output $(EXPERIMENTS) >/dev/null
 	$(BIN)/trigpoint-db experiment averaging --data $(DATA) --output $(EXPERIMENTS) >/dev/null
 	$(BIN)/trigpoint-db experiment anchors --data $(DATA) --output $(EXPERIMENTS) >/dev/null
 	$(BIN)/trigpoint-db experiment ablation --data $(DATA) --output $(EXPERIMENTS) \
-	  $(if $(FP32),--fp32 '$(FP32)') >/dev/null
+	  $(if $(FLOAT),--fp32 '$(FLOAT)') >/dev/null
 	$(BIN)/trigpoint-db experiment redkitchen --data $(DATA) --output $(EXPERIMENTS) >/dev/null
 	$(BIN)/trigpoint-db experiment recall --data $(DATA) --output $(EXPERIMENTS) >/dev/null
 	$(BIN)/trigpoint-db experiment page $(EXPERIMENTS) docs

@@ -210,7 +210,7 @@ def describe_gain(rows: Sequence[Mapping[str, Any]], label: str) -> str:
 def draw(result: Mapping[str, Any], path: Path) -> None:
     """Draw errors and times by the number of anchors, a row of panels for each."""
     sets = by_set(result)
-    figure = make_figure(4.5 * len(sets), 6.5)
+    figure = make_figure(max(6, 4 * len(sets)), 6.5)
     panels = figure.subplots(2, len(sets), sharex=True, squeeze=False)
     for (top, bottom), (name, rows) in zip(panels.T, sets.items(), strict=True):
         numbers = [row["num_anchors"] for row in rows]
@@ -232,7 +232,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
             axes.grid(alpha=0.3)
     panels[0][0].set_ylabel("median position error")
     panels[1][0].set_ylabel("ms, stage upon stage")
-    panels[0][0].legend(fontsize="small")
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     panels[1][0].legend(fontsize="small", loc="upper left")
     figure.supxlabel("anchors")
     save_figure(figure, path)

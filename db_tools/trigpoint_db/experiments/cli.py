@@ -110,13 +110,16 @@ def ablation_command(
     queries: Annotated[int, typer.Option(help="Of each set and split, at the most.", min=1)] = 15,
     model: Model = "base",
     fp32: Annotated[
-        Path | None, typer.Option(help="The network in float32 (.onnx), to compare with INT8.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Has MODEL.fp32.onnx, to compare INT8 with it."),
     ] = None,
     as_json: Json = False,
 ) -> None:
     """Take back our departures from the paper, one after the other: what each brings."""
     sets, store, network = read_splits(data), open_store(output), FeatureModel.load(model)
-    float_network = None if fp32 is None else FeatureModel.load(str(fp32))
+    float_network = None
+    if fp32 is not None:
+        float_network = FeatureModel.load(str(fp32 / f"{network.identity.name}.fp32.onnx"))
     result = ablation.measure(sets, network, float_network, queries, store)
     publish("ablation", ablation, result, store, as_json)
 
