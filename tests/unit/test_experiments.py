@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError
 from trigpoint.frame import Localized
 from trigpoint.localizer import Localizer
-from trigpoint.models.features import FeatureModel
+from trigpoint.models.features import FeatureModel, find_model
 from trigpoint.rigid import Rigid3
 from trigpoint_db.build import read_frame
 from trigpoint_db.experiments import ablation, anchors, averaging, noise
@@ -118,6 +119,21 @@ def test_departures_are_taken_back_one_by_one(data: Path, output: Path, run: Run
     assert out.strip() == ablation.write_table(result)
     assert f"Not measured: {ablation.FLOAT}" in out
     check_picture(output / "ablation.png")
+
+
+def test_a_network_in_float_is_one_more_variant(
+    data: Path, output: Path, tmp_path: Path, run: Run
+) -> None:
+    command = "experiment", "ablation", "--data", data, "--output", output, "--queries", 1
+    code, _, error = run(*command, "--fp32", tmp_path)
+    assert code == 1
+    assert f"{tmp_path}/base.fp32.onnx" in error
+    shutil.copy(find_model("base"), tmp_path / "base.fp32.onnx")  # the same: it changes nothing
+    code, out, _ = run(*command, "--fp32", tmp_path, "--json")
+    assert code == 0
+    result = json.loads(out)
+    assert result["variants"] == list(ablation.VARIANTS)
+    assert ablation.ratios(result, ablation.FLOAT, "median") == [1.0, 1.0]
 
 
 def test_every_variant_is_another_localizer() -> None:
