@@ -71,6 +71,12 @@ def test_7_scenes_is_judged_by_both_ground_truths(run: Run, rooms: Path, tmp_pat
     assert ours[3:] == ["-"] * 7  # the average is of all scenes or of none
     assert "DenseVLAD+Inter. and GeM have the same numbers for Pumpkin, Kitchen, Stairs" in table
     assert (tmp_path / "7scenes.png").stat().st_size > 0
+    code, _, err = run("experiment", "page", tmp_path, tmp_path / "docs")
+    assert code == 0, err
+    assert (
+        f"## 7-Scenes\n\n![7-Scenes](images/experiments/7scenes.png)\n\n{table}"
+        in (tmp_path / "docs" / "experiments.md").read_text()
+    )
 
 
 def test_cambridge_has_the_scale_of_its_owners(run: Run, tmp_path: Path) -> None:

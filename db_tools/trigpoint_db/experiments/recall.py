@@ -293,7 +293,8 @@ def _conclude(result: Mapping[str, Any]) -> list[str]:
             "for data sets that do not have so many. Here more than half are correct in "
             f"{len(mostly)} of {len(sets)} sets ({'; '.join(mostly) or 'none'}). Of the places "
             "that correct images of the map could take, the packaged descriptor fills "
-            f"{100 * share / possible:.0f} %: what lacks is {missing}."
+            f"{100 * share / possible:.0f} %, and images drawn at random would fill "
+            f"{100 * over_all(CHANCE)[1] / possible:.0f} %: what lacks is {missing}."
         ),
     ]
 
