@@ -130,8 +130,10 @@ experiments: $(READY)
 	$(BIN)/trigpoint-db experiment methods --data $(DATA) --output $(EXPERIMENTS) >/dev/null
 	$(BIN)/trigpoint-db experiment timing --data $(DATA) --output $(EXPERIMENTS) \
 	  $(if $(HLOC),--hloc '$(HLOC)') >/dev/null
+	$(BIN)/trigpoint-db experiment redkitchen --data $(DATA) --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment recall --data $(DATA) --output $(EXPERIMENTS) >/dev/null
 	$(BIN)/trigpoint-db experiment page $(EXPERIMENTS) docs
-	rm -rf $(EXPERIMENTS)/maps # the next run measures anew
+	rm -rf $(EXPERIMENTS)/maps $(EXPERIMENTS)/room # the next run measures anew
 
 # Profiles of maps, and retrieval in maps of up to a million images; half an hour and 2 GB.
 bench-maps: $(READY)

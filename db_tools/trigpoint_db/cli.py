@@ -10,6 +10,7 @@ import typer
 
 from trigpoint.errors import TrigpointError
 from trigpoint_db.experiments.cli import app as experiments
+from trigpoint_db.experiments.cli_scenes import app as scenes
 from trigpoint_db.commands import (
     build,
     datasets,
@@ -30,6 +31,7 @@ app = typer.Typer(
 )
 for commands in (build, results, maps, survey, report, datasets, recordings, networks, fleet):
     app.add_typer(commands.app)  # on the same level
+experiments.add_typer(scenes)
 app.add_typer(experiments, name="experiment")
 
 

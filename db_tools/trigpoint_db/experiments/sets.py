@@ -19,19 +19,19 @@ from trigpoint_db.importers.base import Dataset
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.importers.registry import read_dataset
 from trigpoint_db.poses import read_names
-from trigpoint_db.terminal import track
+from trigpoint_db.terminal import track, track_calibration
 
 T = TypeVar("T")
 SPLITS = {"": "", ", block": "_block"}  # how they are named in tables, and in the files' names
 
 
-def read_splits(data: Path) -> dict[str, Dataset]:
+def read_splits(data: Path, pattern: str = "*") -> dict[str, Dataset]:
     """Read the sets in a folder, each with its splits: `map.txt` and `queries.txt`, `*_block.txt`.
 
-    Each is a folder with `images/` and a COLMAP model in `sparse/`.
+    Each is a folder with `images/` and a COLMAP model in `sparse/`, of a name like `pattern`.
     """
     found = {}
-    for folder in find_sets(data):
+    for folder in find_sets(data, pattern):
         posed = read_model(folder / "sparse")
         for label, suffix in SPLITS.items():
             names = folder / f"map{suffix}.txt", folder / f"queries{suffix}.txt"
@@ -70,9 +70,9 @@ def read_scenes(root: Path) -> dict[str, Dataset]:
     return scenes
 
 
-def find_sets(data: Path) -> list[Path]:
+def find_sets(data: Path, pattern: str = "*") -> list[Path]:
     """List the folders of sets."""
-    folders = sorted(path.parent for path in data.glob("*/sparse") if path.is_dir())
+    folders = sorted(path.parent for path in data.glob(f"{pattern}/sparse") if path.is_dir())
     if not folders:
         raise ConfigError(
             f"{data} holds no sets; each is a folder with images/, a COLMAP model in sparse/, "
@@ -85,14 +85,18 @@ def find_sets(data: Path) -> list[Path]:
 def open_map(
     folder: Path, name: str, dataset: Dataset, network: FeatureModel
 ) -> Iterator[MapReader]:
-    """Open the map of a data set that is in a folder, or made there."""
+    """Open the map of a data set that is in a folder, or made there; one half made goes on."""
     path = folder / f"{name.replace(', ', '_')}_{network.identity.sha256[:8]}.tpmap"
     if not is_map_of(path, dataset, network):
         folder.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         images = dataset.mapped
-        build_map(path, track(images, f"{name}: map", len(images)), dataset.images, network)
-        calibrate_map(path, network)
+        tracked = track(images, f"{name}: map", len(images))
+        build_map(path, tracked, dataset.images, network, resume=True)
+    with MapReader.open(path) as reader:
+        is_calibrated = reader.pose_noise is not None
+    if not is_calibrated:
+        calibrate_map(path, network, track_calibration)
     with MapReader.open(path, network.identity) as reader:
         yield reader
 
