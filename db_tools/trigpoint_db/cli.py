@@ -9,17 +9,17 @@ import threadpoolctl
 import typer
 
 from trigpoint.errors import TrigpointError
-from trigpoint_db.experiments.cli import app as experiments
-from trigpoint_db.experiments.cli_scenes import app as scenes
 from trigpoint_db.commands import (
     build,
     datasets,
+    experiments,
     fleet,
     maps,
     networks,
     recordings,
     report,
     results,
+    scenes,
     survey,
 )
 
@@ -31,8 +31,8 @@ app = typer.Typer(
 )
 for commands in (build, results, maps, survey, report, datasets, recordings, networks, fleet):
     app.add_typer(commands.app)  # on the same level
-experiments.add_typer(scenes)
-app.add_typer(experiments, name="experiment")
+experiments.app.add_typer(scenes.app)
+app.add_typer(experiments.app, name="experiment")
 
 
 @app.callback()

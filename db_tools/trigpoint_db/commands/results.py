@@ -13,7 +13,7 @@ import typer
 
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError, SourceError
-from trigpoint.frame import Failed, Localized, describe, summarize
+from trigpoint.frame import Failed
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import load_matcher

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from trigpoint.frame import Localized, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.options import LocalizerOptions
@@ -66,11 +65,12 @@ def _localize_scene(scene: Scene, model: FeatureModel, num_anchors: int, store: 
         localizer = Localizer(model, reader, options)
         for unit in store.each(list(queries), f"{scene.label}: localizing"):
             (outcome,) = localize_images(localizer, [queries[unit]], data.images)
-            if isinstance(outcome.result, Localized):
-                pose = outcome.result.cam_from_world
-                store[unit] = [*pose.quaternion.tolist(), *pose.t.tolist()]
-            else:
-                store[unit] = summarize(outcome.result)
+            pose = outcome.cam_from_world
+            store[unit] = (
+                outcome.summarize()
+                if pose is None
+                else [*pose.quaternion.tolist(), *pose.t.tolist()]
+            )
 
 
 def _unit(scene: Scene, query: str) -> str:

@@ -10,9 +10,9 @@ import typer
 
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.retrieval import RetrievalModel
+from trigpoint_db.commands.experiments import DATA, RESULTS, ROOT, Output, open_store, publish
 from trigpoint_db.experiments import recall, scenes
 from trigpoint_db.experiments.benchmarks import read_benchmark
-from trigpoint_db.experiments.cli import DATA, RESULTS, ROOT, Output, open_store, publish
 from trigpoint_db.experiments.sets import read_scenes, read_splits
 from trigpoint_db.terminal import Json, Model, Retrieval
 
