@@ -66,7 +66,7 @@ def zenoh_file(name: str, certificates: Path, port: int, which: int = 1) -> Path
     text = text.replace("ground", name)
     for file in ("ca.pem", f"{name}.pem", f"{name}.key"):
         text = text.replace(f'"{file}"', f'"{certificates / file}"')
-    path = certificates / f"{name}{which}.json5"
+    path = certificates / f"{name}.json5"
     path.write_text(text)
     return path
 
