@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.unit.conftest import Run
-from tests.unit.layouts import View
+from tests.unit.layouts import View, write_cambridge
 from tests.unit.posed_sets import write_set
 from tests.unit.synthetic_rays import random_scene
 from trigpoint.database.reader import MapReader
@@ -81,6 +81,18 @@ def test_scenes_of_public_data_sets_are_read_from_their_folder(
     (row,) = json.loads(out)["rows"]
     assert (row["set"], row["num_mapped"], row["num_queries"]) == ("redkitchen", 3, 3)
     assert row["num_chosen"] == 2
+
+
+def test_a_scene_of_the_papers_table_stands_beside_it(tmp_path: Path, run: Run) -> None:
+    write_cambridge(tmp_path / "data" / "KingsCollege")
+    command = "experiment", "averaging", "--root", tmp_path / "data", "--output", tmp_path
+    code, out, _ = run(*command)
+    assert code == 0
+    (row,) = read_result(tmp_path / "averaging.json")["rows"]
+    assert (row["set"], row["num_mapped"], row["num_queries"]) == ("KingsCollege", 3, 2)
+    (kings,) = [line for line in out.splitlines() if line.startswith("| King's")]
+    assert kings.startswith("| King's | 20 cm | 18 cm | ")
+    assert "-" not in kings.split(" | ")[3:][0]
 
 
 def test_more_anchors_step_by_step(data: Path, output: Path, run: Run) -> None:
