@@ -51,10 +51,11 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def label_plainly(axis: Axis) -> None:
-    """Label a logarithmic axis 0.1, 0.2, 0.5, 1 ..., not by powers."""
+    """Label a logarithmic axis 0.1, 0.2, 0.5, 1 ... (0.1, 1 ... a long one), not by powers."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1,) if high > 100 * low > 0 else (1, 2, 5)))
     axis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.set_minor_formatter(NullFormatter())
 

@@ -21,7 +21,7 @@ from trigpoint_db.experiments.averaging import describe_choice
 from trigpoint_db.experiments.sets import choose, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import geometric_mean, markdown, median, number
-from trigpoint_db.figures import make_figure, save_figure
+from trigpoint_db.figures import label_plainly, make_figure, save_figure
 from trigpoint_db.importers.base import Dataset
 from trigpoint_db.methods.baseline import Baseline, Estimate
 from trigpoint_db.methods.matched import Matched, match_frame
@@ -228,6 +228,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
     axes.set_yticks(range(len(rows)), [row["set"] for row in rows])
     axes.invert_yaxis()
     axes.set_xscale("log")
+    label_plainly(axes.xaxis)
     axes.set_xlabel(f"median position error, over that of {OURS}")
     axes.grid(axis="x", which="both", alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
