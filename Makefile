@@ -16,8 +16,8 @@ SECONDS ?= 600
 LIB = $(DESTDIR)$(PREFIX)/lib
 SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
-.PHONY: demo test test-oak test-systemd test-v4l2 check golden
-.PHONY: bench bench-models bench-localizer bench-daemon soak wheel-test clean
+.PHONY: demo test kill-test test-oak test-systemd test-v4l2 check golden
+.PHONY: bench bench-building bench-models bench-localizer bench-daemon bench-maps walkthrough soak wheel-test clean
 .PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
@@ -39,14 +39,18 @@ demo: $(READY)
 	@PATH="$(CURDIR)/$(BIN):$$PATH" sh demo.sh $(DEMO)
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: $(READY)
 	$(BIN)/ruff format --no-cache --check .
 	$(BIN)/ruff check --no-cache .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
+
+# A map changed by processes that are killed at random moments; half a minute.
+kill-test: $(READY)
+	$(BIN)/python -m tests.unit.run_kills 200
 
 # The camera source on a real kernel's virtual camera, in qemu; about a minute.
 test-v4l2: $(READY)
@@ -64,7 +68,7 @@ golden: $(READY)
 bench: $(READY)
 	@mkdir -p build/bench && rm -f build/bench/map.tpmap
 	@if test -d $(KITCHEN); then \
-	  $(BIN)/trigpoint-db build build/bench/map.tpmap --colmap $(KITCHEN) --images $(KITCHEN)/images \
+	  $(BIN)/trigpoint-db build build/bench/map.tpmap $(KITCHEN) \
 	    --list $(KITCHEN)/map.txt >/dev/null && \
 	  $(BIN)/python benchmarks/stage_times.py build/bench/map.tpmap \
 	    --images $(KITCHEN)/images --queries $(KITCHEN)/queries.txt; \
@@ -73,6 +77,12 @@ bench: $(READY)
 	  $(BIN)/python benchmarks/stage_times.py $(DEMO)/map.tpmap \
 	    --images $(DEMO)/flight --queries $(DEMO)/queries.txt; \
 	fi
+
+# Images a second that maps are built with, on the same data.
+bench-building: $(READY)
+	test -d $(KITCHEN) || test -d $(DEMO)/survey || $(BIN)/trigpoint-db demo $(DEMO)
+	$(BIN)/python -m benchmarks.building \
+	  $(if $(wildcard $(KITCHEN)),$(KITCHEN),$(DEMO))
 
 # Our networks beside RootSIFT and, where its checkout is named, EdgePoint2, which needs torch:
 # make bench-models EDGEPOINT2=../EdgePoint2 FP32=build/fp32
@@ -103,6 +113,15 @@ soak: $(READY) $(DEMO)/map.tpmap
 
 $(DEMO)/map.tpmap: | $(READY)
 	$(BIN)/trigpoint-db demo $(DEMO)
+
+# Profiles of maps, and retrieval in maps of up to a million images; half an hour and 2 GB.
+bench-maps: $(READY)
+	@mkdir -p build/bench
+	$(BIN)/python -m benchmarks.maps $(DATA) --output build/bench/maps.md
+
+# What the commands on maps print on real sets, into docs/maps.md; some ten minutes.
+walkthrough: $(READY)
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.maps.walkthrough $(DATA)
 
 # The suite against the installed wheel, not the checkout.
 wheel-test: $(READY)

@@ -60,7 +60,7 @@ def main() -> None:
     threadpoolctl.threadpool_limits(1, user_api="blas")
     network = FeatureModel.load(arguments.model)
     frames = [
-        read_frame(arguments.images / query.name, query.camera, query.name)
+        read_frame(arguments.images, query.name, query.camera)
         for query in read_queries(arguments.queries)
     ]
     times: dict[str, dict[str, list[float]]] = {k: {} for k in OPTIONS}

@@ -1,5 +1,6 @@
 """What tests share: the demo's world, made once a session, and the real data, where present."""
 
+import fcntl
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -50,11 +51,18 @@ def model() -> FeatureModel:
 
 
 @pytest.fixture(scope="session")
-def demo(tmp_path_factory: pytest.TempPathFactory, model: FeatureModel) -> Demo:
-    folder = tmp_path_factory.mktemp("demo")
-    survey = make_demo(folder, num_survey=140, num_flight=16, progress=without_progress)
-    build_map(folder / "map.tpmap", survey, folder / "survey", model)
-    calibrate_map(folder / "map.tpmap", model)
+def demo(tmp_path_factory: pytest.TempPathFactory, worker_id: str, model: FeatureModel) -> Demo:
+    shared = tmp_path_factory.getbasetemp()
+    if worker_id != "master":  # one of several processes; the first to come makes it for all
+        shared = shared.parent
+    folder, made = shared / "demo", shared / "demo-made"
+    with (shared / "demo-lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            survey = make_demo(folder, num_survey=140, num_flight=16, progress=without_progress)
+            build_map(folder / "map.tpmap", survey, folder / "survey", model)
+            calibrate_map(folder / "map.tpmap", model)
+            made.touch()
     return Demo(folder)
 
 

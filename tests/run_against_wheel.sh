@@ -19,5 +19,5 @@ cp -R tests pyproject.toml "$work/run"
 cd "$work/run"
 ../venv/bin/python -c 'import trigpoint; assert "site-packages" in trigpoint.__file__, trigpoint'
 # The code that trains, or measures, is in no wheel; accuracy is that of the checkout.
-exec ../venv/bin/python -m pytest -o pythonpath=. -p no:cacheprovider \
+exec ../venv/bin/python -m pytest -n auto --dist loadfile -o pythonpath=. -p no:cacheprovider \
   --ignore tests/training --ignore tests/benchmarks --ignore tests/data

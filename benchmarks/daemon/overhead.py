@@ -27,6 +27,7 @@ from trigpoint.output import check_output, open_text
 from trigpointd.messages.cdr import decode_pose
 
 WARM_UP = 30  # frames
+PATIENCE_S = 120.0  # for the next pose, on a busy machine
 SERVICE_SETTINGS = Path(__file__).parents[2] / "systemd" / "trigpoint.toml"
 LOCALIZER, TOTAL, OVERHEAD = "localizer (taken off)", "capture to pose", "**overhead**"
 # Where the time goes: from the beginning ("<") or the end (">") of one probe to that of another.
@@ -71,9 +72,16 @@ def measure(setup: Setup, num_frames: int) -> dict[str, NDArray[np.float64]]:
     with subscriber(receive) as (_, port):
         settings = setup.prepare(port)
         with running(settings, "benchmarks.daemon.probes", str(times_path.resolve())) as process:
-            while len(received) < WARM_UP + num_frames:
+            count, since = 0, time.monotonic()
+            while count < WARM_UP + num_frames:
                 check_alive(process)
                 time.sleep(0.2)
+                if len(received) > count:
+                    count, since = len(received), time.monotonic()
+                elif time.monotonic() - since > PATIENCE_S:
+                    raise TrigpointError(
+                        f"no pose for {PATIENCE_S:g} s; see the daemon's stderr.txt"
+                    )
     times: dict[str, dict[int, int]] = {}
     for line in times_path.read_text().splitlines():
         name, time_ns, start_ns, end_ns = line.split()

@@ -31,7 +31,7 @@ _PROBES: dict[str, tuple[Any, str, Callable[..., int]]] = {
     "decode": (Image, "gray", attrgetter("time_ns")),
     "put": (Latest, "put", lambda _, captured: captured.frame.time_ns),
     "process": (Pipeline, "process", lambda _, captured, *more: captured.frame.time_ns),
-    "localize": (Localizer, "localize", lambda _, frame: frame.time_ns),
+    "localize": (Localizer, "localize", lambda _, frame, *more: frame.time_ns),
     "record": (Recorder, "publish", lambda _, output: output.time_ns),
     "publish": (ZenohSink, "publish", lambda _, output: output.time_ns),
     "write": (RollingLog, "write", lambda _, output: output.time_ns),

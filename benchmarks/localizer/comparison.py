@@ -88,12 +88,12 @@ def compare(
                 for name, options in methods.items()
             }
             queries = read_queries(folder / f"queries{split}.txt")
-            first = read_frame(folder / "images" / queries[0].name, queries[0].camera, "warm-up")
+            first = read_frame(folder / "images", queries[0].name, queries[0].camera)
             for localizer in localizers.values():
                 localizer.localize(first)
             for query in queries:
                 truth = poses[query.name].cam_from_world
-                frame = read_frame(folder / "images" / query.name, query.camera, query.name)
+                frame = read_frame(folder / "images", query.name, query.camera)
                 results = {}
                 for name, localizer in localizers.items():
                     results[name], ms = timed(localizer.localize, frame)

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from trigpoint.errors import ConfigError
 from trigpoint.frame import Anchor
 from trigpoint.rigid import Rigid3
-from trigpoint_db.importers.colmap import PosedImage, write_model
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import write_model
 
 MAX_ERROR_PX = 12.0  # the default of hloc's localize_sfm
 

@@ -31,7 +31,8 @@ from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import build_map, read_frame, select_images
 from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.demo import CAMERA
-from trigpoint_db.importers.colmap import PosedImage, read_model
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.poses import read_names, read_queries
 from trigpoint_db.synthetic import flight_poses, make_room, render, survey_poses
 
@@ -209,7 +210,7 @@ def real_place(folder: Path, network: FeatureModel, scratch: Path) -> Place:
     calibrate_map(path, network)
     frames = [
         (
-            read_frame(folder / "images" / query.name, query.camera, query.name),
+            read_frame(folder / "images", query.name, query.camera),
             poses[query.name].cam_from_world,
         )
         for query in read_queries(folder / "queries.txt")

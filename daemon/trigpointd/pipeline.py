@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from trigpoint.database.reader import MapReader
-from trigpoint.errors import DatabaseError, ModelError
-from trigpoint.frame import Failed, Frame, Localized, Result, describe, summarize
+from trigpoint.errors import ConfigError, DatabaseError, ModelError
+from trigpoint.frame import Failed, Frame, Localized, Prior, Result, describe, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import load_matcher
@@ -86,10 +86,10 @@ class Pipeline:
         }
         return Output(captured, result, pose, json.dumps(status).encode())
 
-    def localize(self, frame: Frame | BadFrame) -> Result | Failed:
+    def localize(self, frame: Frame | BadFrame, prior: Prior | None = None) -> Result | Failed:
         """Localize one frame in the map as it is now."""
         self._refresh_map()
-        return self._localize(frame)
+        return self._localize(frame, prior)
 
     def _refresh_map(self) -> None:
         """Take up what was added to the map; where that cannot be used, keep what there was."""
@@ -102,30 +102,38 @@ class Pipeline:
             _log.error("%s; going on with the map as it was, as far as it can be read", problem)
         elif is_new or (self.map_problem and not problem):
             _log.info("the map is now of generation %d", self.reader.generation)
-            self._reported.clear()
+            self._look_for_sessions()
         self.map_problem = problem
 
-    def _localize(self, frame: Frame | BadFrame) -> Result | Failed:
+    def _look_for_sessions(self) -> None:
+        try:
+            self.localizer.check_sessions()
+        except ConfigError as error:
+            self._report(f"{error}; going on without it")
+
+    def _localize(self, frame: Frame | BadFrame, prior: Prior | None) -> Result | Failed:
         if isinstance(frame, BadFrame):
             return Failed(frame.reason, frame.detail)
         try:
-            return self.localizer.localize(frame)
+            return self.localizer.localize(frame, prior)
         # A damaged image of the map, a network that fails on this frame: others may do.
         except DatabaseError as error:
-            return self._failed("BAD_MAP", error)
+            return self._failed("BAD_MAP", str(error))
         except ModelError as error:
-            return self._failed("BAD_NETWORK", error)
+            return self._failed("BAD_NETWORK", str(error))
         except Exception as error:  # nothing that a camera shows may end the daemon
-            return self._failed("INTERNAL_ERROR", error)
-
-    def _failed(self, reason: str, error: Exception) -> Failed:
-        text = str(error)
-        if reason == "INTERNAL_ERROR":
             text = " ".join(f"{type(error).__name__}: {error}".split())
-        if text not in self._reported and len(self._reported) < _MAX_REPORTED:
-            self._reported.add(text)
-            _log.error("%s", text, exc_info=reason == "INTERNAL_ERROR")
-        return Failed(reason, text)
+            return self._failed("INTERNAL_ERROR", text, error)
+
+    def _failed(self, reason: str, detail: str, unexpected: Exception | None = None) -> Failed:
+        self._report(detail, unexpected)
+        return Failed(reason, detail)
+
+    def _report(self, problem: str, unexpected: Exception | None = None) -> None:
+        """Say once what is wrong."""
+        if problem not in self._reported and len(self._reported) < _MAX_REPORTED:
+            self._reported.add(problem)
+            _log.error("%s", problem, exc_info=unexpected)
 
 
 @contextlib.contextmanager
@@ -142,4 +150,5 @@ def open_pipeline(config: Config) -> Iterator[Pipeline]:
         localizer = Localizer(
             model, reader, config.localizer, clock=time.perf_counter, matcher=matcher
         )
+        localizer.check_sessions()
         yield Pipeline(localizer, reader, config.camera.body_from_camera, config.map_frame)

@@ -6,6 +6,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from datetime import date
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from trigpoint.camera import Camera
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import RequestError, TrigpointError
-from trigpoint.frame import Frame, describe
+from trigpoint.frame import Frame, Prior, Session, describe
 from trigpoint.images import decode_gray, read_size
 from trigpoint.rigid import Rigid3
 from trigpointd.config import Config, RequestsConfig
@@ -96,8 +97,9 @@ class Responder:
         return self._map_actions[action](request)
 
     def _localize(self, request: Request) -> dict[str, Any]:
-        (camera,) = _parse(request, "camera")
-        result = self._pipeline.localize(self._frame(request, camera, "request"))
+        (camera,) = _parse(request, "camera", optional=("position", "radius_m"))
+        prior = _parse_prior(request.parameters)
+        result = self._pipeline.localize(self._frame(request, camera, "request"), prior)
         return {**describe(result), "map_generation": self._pipeline.reader.generation}
 
     def _info(self, request: Request) -> dict[str, Any]:
@@ -108,6 +110,7 @@ class Responder:
             "generation": reader.generation,
             "num_images": len(reader),
             "model": reader.model.name,
+            "sessions": [str(session) for session in reader.sessions],
             "pose_noise": None if noise is None else asdict(noise),
         }
 
@@ -117,13 +120,15 @@ class Responder:
 
     def _add(self, request: Request) -> dict[str, Any]:
         self._require_changes()
-        _, name, camera, pose = _parse(request, "action", "name", "camera", "cam_from_world")
-        cam_from_world = _parse_pose(pose)
+        _, name, camera, pose = _parse(
+            request, "action", "name", "camera", "cam_from_world", optional=("session", "date")
+        )
+        cam_from_world, session = _parse_pose(pose), _parse_session(request.parameters)
         frame = self._frame(request, camera, name)
         localizer = self._pipeline.localizer
         features = localizer.model.extract(frame.image, localizer.options.max_keypoints)
         with MapWriter.open(self._config.map, localizer.model.identity) as writer:
-            writer.add(name, frame.camera, cam_from_world, features)
+            writer.add(name, frame.camera, cam_from_world, features, session)
         return {**self._refreshed(), "num_keypoints": len(features)}
 
     def _remove(self, request: Request) -> dict[str, Any]:
@@ -212,6 +217,29 @@ def _parse_pose(text: str) -> Rigid3:
     if not np.abs(t).max() < _MAX_COORDINATE:
         raise RequestError(f"cam_from_world is {text!r}; its translation is too far away")
     return Rigid3.from_quaternion(quaternion, t)
+
+
+def _parse_session(parameters: Mapping[str, str]) -> Session | None:
+    name, day = parameters.get("session"), parameters.get("date")
+    if name is None and day is None:
+        return None
+    try:
+        return Session(name or "", None if day is None else date.fromisoformat(day))
+    except ValueError:
+        raise RequestError(f"date is {day!r}; write 2026-01-31") from None
+
+
+def _parse_prior(parameters: Mapping[str, str]) -> Prior | None:
+    position, radius = (parameters.get(name) for name in ("position", "radius_m"))
+    if position is None and radius is None:
+        return None
+    try:
+        x, y, z = (float(number) for number in (position or "").split(","))
+        return Prior((x, y, z), float(radius or ""))
+    except ValueError:
+        raise RequestError(
+            f"position is {position!r} and radius_m {radius!r}; write both, 'x,y,z' and a number"
+        ) from None
 
 
 def _require_plausible(camera: Camera) -> None:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
-import glob
-import os
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from trigpoint.camera import Camera
-from trigpoint.database.writer import MapWriter
-from trigpoint.errors import ConfigError, DatabaseError
-from trigpoint.frame import Frame
-from trigpoint.images import read_gray
-from trigpoint.models.features import FeatureModel
-from trigpoint_db.importers.colmap import PosedImage
+import numpy as np
 
-COMMIT_EVERY = 100  # images; until then they are in memory
+from trigpoint.camera import Camera
+from trigpoint.database.codec import Profile
+from trigpoint.database.reader import MapReader
+from trigpoint.database.replacing import COMMIT_EVERY, partial_map, resumable_map
+from trigpoint.database.writer import MapWriter
+from trigpoint.errors import ConfigError
+from trigpoint.frame import Frame, LocalFeatures, Session
+from trigpoint.models.features import FeatureModel
+from trigpoint_db.extraction import Crew, EncodedImage, extract_by_workers, extract_features
+from trigpoint_db.importers.base import PosedImage
 
 
 def select_images(images: Sequence[PosedImage], names: Sequence[str]) -> list[PosedImage]:
@@ -25,25 +26,40 @@ def select_images(images: Sequence[PosedImage], names: Sequence[str]) -> list[Po
     unknown = [name for name in names if name not in by_name]
     if unknown:
         raise ConfigError(
-            f"{len(unknown)} of {len(names)} listed images are not in the COLMAP model, "
+            f"{len(unknown)} of {len(names)} listed images are not among those with a pose, "
             f"such as {unknown[0]!r}"
         )
     return [by_name[name] for name in names]
 
 
-def check_files(names: Iterable[str], folder: Path) -> None:
-    """Refuse before any work is done where an image is missing."""
-    missing = [name for name in names if not (folder / name).is_file()]
+def select_new(
+    images: Sequence[PosedImage], path: Path, *, skip_existing: bool
+) -> list[PosedImage]:
+    """Keep the images that a map does not have; unless they may be skipped, others are an error."""
+    with MapReader.open(path) as reader:
+        names = set(reader.names())
+    new = [image for image in images if image.name not in names]
+    if len(new) < len(images) and not skip_existing:
+        known = next(image.name for image in images if image.name in names)
+        raise ConfigError(
+            f"{path} holds {len(images) - len(new)} of {len(images)} images already, such as "
+            f"{known!r}; leave them out with --skip-existing"
+        )
+    return new
+
+
+def check_files(names: Iterable[str], images: Path) -> None:
+    """Refuse before any work is done where an image is missing in a folder."""
+    if images.is_file():
+        return  # a recording
+    missing = [name for name in names if not (images / name).is_file()]
     if missing:
-        raise ConfigError(f"{len(missing)} images are missing in {folder}, such as {missing[0]!r}")
+        raise ConfigError(f"{len(missing)} images are missing in {images}, such as {missing[0]!r}")
 
 
-def read_frame(path: Path, camera: Camera, name: str) -> Frame:
-    """Read an image file that a camera has taken."""
-    try:
-        return Frame(read_gray(path), camera, name=name)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+def read_frame(images: Path, name: str, camera: Camera) -> Frame:
+    """Read an image that a camera has taken, from a folder or from a recording."""
+    return EncodedImage.read(images, name, camera).decode()
 
 
 def build_map(
@@ -53,46 +69,45 @@ def build_map(
     model: FeatureModel,
     *,
     max_keypoints: int = 1024,
+    session: Session | None = None,
+    crew: Crew | None = None,
+    resume: bool = False,
+    profile: Profile | None = None,
 ) -> int:
-    """Write a new map; it appears under its name when it is complete. Returns the image count."""
-    refuse_existing(path)
-    _remove_leftovers(path)
-    # Under a name of its own, so that two builds at once do not meet.
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        with MapWriter.create(partial, model.identity) as writer:
-            for image in images:
-                _add(writer, image, folder, model, max_keypoints)
-                if len(writer) % COMMIT_EVERY == 0:
-                    writer.commit()
-            count = len(writer)
-        refuse_existing(path)
-        partial.rename(path)
-    except DatabaseError as error:
-        raise DatabaseError(str(error).replace(str(partial), str(path))) from error
-    finally:
-        _remove(partial)
-    return count
+    """Write a new map; it appears under its name when it is complete. Returns the image count.
+
+    The images are read from `folder` by `read_frame`. The same images in the same order give the
+    same bytes, whoever does the work. With `resume`, what an interrupted build of the same images
+    and profile has committed is taken over; an interrupted one leaves the same records then.
+    """
+    with resumable_map(path, model.identity, profile, resume=resume) as writer:
+        remaining = iter(images)
+        if len(writer):
+            _pass_over(remaining, partial_map(path), session)
+        for image, features in _extract(remaining, folder, model, max_keypoints, crew):
+            writer.add(image.name, image.camera, image.cam_from_world, features, session)
+            if len(writer) % COMMIT_EVERY == 0:
+                writer.commit()
+        return len(writer)
 
 
-def _remove(partial: Path) -> None:
-    for leftover in (partial, partial.with_name(partial.name + "-lock")):
-        with contextlib.suppress(OSError):
-            leftover.unlink()
-
-
-def _remove_leftovers(path: Path) -> None:
-    """Remove what builds that were killed have left."""
-    for partial in path.parent.glob(f"{glob.escape(path.name)}.*.partial"):
-        owner = partial.name.removesuffix(".partial").rpartition(".")[2]
-        if owner.isdecimal() and not Path("/proc", owner).exists():
-            _remove(partial)
-
-
-def refuse_existing(path: Path) -> None:
-    """Keep a map that is there."""
-    if path.exists():
-        raise ConfigError(f"{path} exists; remove it first, or add to it with --append")
+def _pass_over(images: Iterator[PosedImage], path: Path, session: Session | None) -> None:
+    """Take off the first images, which a map holds already; others in their places are an error."""
+    with MapReader.open(path) as reader:
+        names, sessions = reader.names(), reader.sessions_by_index()
+        for index, name in enumerate(names):
+            camera, pose = reader.view(index)
+            image = next(images, None)
+            if (
+                image is None
+                or (image.name, image.camera, session) != (name, camera, sessions[index])
+                or not np.allclose(image.cam_from_world.R, pose.R, rtol=0, atol=1e-9)
+                or not np.allclose(image.cam_from_world.t, pose.t, rtol=1e-9, atol=0)
+            ):
+                raise ConfigError(
+                    f"{path} was begun with other images, poses or sessions: its image {index} is "
+                    f"{name!r}; give those again, or remove it to begin anew"
+                )
 
 
 def append_map(
@@ -102,18 +117,35 @@ def append_map(
     model: FeatureModel,
     *,
     max_keypoints: int = 1024,
+    session: Session | None = None,
+    crew: Crew | None = None,
 ) -> int:
-    """Add images to a map, all or none of them. Returns how many."""
+    """Add images to a map, each of which is there for good once it is added. Returns how many."""
     with MapWriter.open(path, model.identity) as writer:
         before = len(writer)
-        for image in images:
-            _add(writer, image, folder, model, max_keypoints)
+        for image, features in _extract(images, folder, model, max_keypoints, crew):
+            writer.add(image.name, image.camera, image.cam_from_world, features, session)
+            writer.commit()
         return len(writer) - before
 
 
-def _add(
-    writer: MapWriter, image: PosedImage, folder: Path, model: FeatureModel, max_keypoints: int
-) -> None:
-    frame = read_frame(folder / image.name, image.camera, image.name)
-    features = model.extract(frame.image, max_keypoints)
-    writer.add(image.name, image.camera, image.cam_from_world, features)
+def _extract(
+    images: Iterable[PosedImage],
+    folder: Path,
+    model: FeatureModel,
+    max_keypoints: int,
+    crew: Crew | None,
+) -> Iterator[tuple[PosedImage, LocalFeatures]]:
+    """Pair images with their features; few more than are in work are read ahead."""
+    waiting: deque[PosedImage] = deque()
+
+    def read() -> Iterator[EncodedImage]:
+        for image in images:
+            waiting.append(image)
+            yield EncodedImage.read(folder, image.name, image.camera)
+
+    if crew is None:
+        extracted = extract_features(read(), model, max_keypoints)
+    else:
+        extracted = extract_by_workers(read(), crew, max_keypoints)
+    return ((waiting.popleft(), features) for features in extracted)

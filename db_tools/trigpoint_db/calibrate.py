@@ -23,7 +23,9 @@ from trigpoint.frame import PoseNoise
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.options import LocalizerOptions
-from trigpoint.stages import match_anchors, mean_distance
+from trigpoint.stages import mean_distance
+from trigpoint_db.leave_one_out import localize_without
+from trigpoint_db.overlap import spread_indices
 
 Array = NDArray[np.float64]
 
@@ -52,8 +54,7 @@ def calibrate_map(
 ) -> PoseNoise | None:
     """Measure the noise of a map's poses and write it into the map; `track` shows progress."""
     with MapReader.open(path, model.identity) as reader:
-        spread = np.linspace(0, len(reader), NUM_IMAGES, endpoint=False).astype(int)
-        images = np.unique(spread).tolist() if len(reader) else []
+        images = spread_indices(len(reader), NUM_IMAGES)
         noise = measure_pose_noise(Localizer(model, reader, OPTIONS), track(images))
     with MapWriter.open(path, model.identity) as writer:
         writer.set_pose_noise(noise)
@@ -91,26 +92,17 @@ def _fit(errors: Array, covariances: Array, distances: Array, levels: Array) -> 
 
 
 def _try_image(localizer: Localizer, index: int, gap: int) -> Trial | None:
-    reader, options = localizer.reader, localizer.options
-    features, image = reader.features(index), reader.anchor(index)
-    near = 2 * gap + 1
-    found, _ = reader.search(
-        features.global_descriptor, options.num_anchors + near, options.anchor_diversity
-    )
-    others = found[np.abs(found - index) > gap][: options.num_anchors]
-    if len(others) < 2:
+    near = range(max(0, index - gap), min(len(localizer.reader), index + gap + 1))
+    held_out = localize_without(localizer, index, near)
+    if held_out is None:
         return None
-    anchors = [reader.anchor(int(other)) for other in others]
-    query = match_anchors(
-        image.camera, features, anchors, localizer.matcher, localizer.model.long_side_px
-    )
-    solution = localizer.solve(query)
+    solution = held_out.solution
     if solution.refined is None or solution.seen is None:
         return None
-    truth, pose = image.cam_from_world, solution.refined.cam_from_world
+    truth, pose = held_out.truth, solution.refined.cam_from_world
     dtheta = Rotation.from_matrix(truth.R.T @ pose.R).as_rotvec()
     error = np.concatenate([truth.center - pose.center, dtheta])
-    distance = mean_distance(query, solution.seen, pose)
+    distance = mean_distance(held_out.query, solution.seen, pose)
     return Trial(error, solution.refined.covariance, distance)
 
 

@@ -15,7 +15,8 @@ from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
 from trigpoint.poses import format_pose
 from trigpoint.rigid import Rigid3
-from trigpoint_db.importers.colmap import PosedImage, write_model
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import write_model
 from trigpoint_db.recording import START_TIME_NS, RecordedImage, write_recording
 from trigpoint_db.synthetic import flight_poses, make_room, render, survey_poses
 

@@ -16,17 +16,19 @@ from rich.table import Table
 
 from trigpoint.errors import ConfigError
 from trigpoint.rigid import Rigid3, rotation_angle
-from trigpoint_db.poses import sort_names
+from trigpoint_db.figures import make_figure, save_figure
+from trigpoint_db.importers.colmap import read_model
+from trigpoint_db.poses import read_poses, sort_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import PathCollection
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
 # The paper's accuracy levels (its table of Aachen and RobotCar Seasons): metres, degrees.
 THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
-PICTURES = (".png", ".svg", ".pdf")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,32 +62,32 @@ class Evaluation:
     @property
     def median_position_m(self) -> float:
         """Median position error."""
-        return _percentile(self.position_errors_m, 50)
+        return percentile(self.position_errors_m, 50)
 
     @property
     def median_rotation_deg(self) -> float:
         """Median rotation error."""
-        return _percentile(self.rotation_errors_deg, 50)
+        return percentile(self.rotation_errors_deg, 50)
 
     @property
     def p90_position_m(self) -> float:
         """90th percentile of the position errors."""
-        return _percentile(self.position_errors_m, 90)
+        return percentile(self.position_errors_m, 90)
 
     @property
     def p90_rotation_deg(self) -> float:
         """90th percentile of the rotation errors."""
-        return _percentile(self.rotation_errors_deg, 90)
+        return percentile(self.rotation_errors_deg, 90)
 
     @property
     def localized_median_position_m(self) -> float:
         """Median position error of the localized queries only."""
-        return _percentile(self.position_errors_m[self.localized], 50)
+        return percentile(self.position_errors_m[self.localized], 50)
 
     @property
     def localized_median_rotation_deg(self) -> float:
         """Median rotation error of the localized queries only."""
-        return _percentile(self.rotation_errors_deg[self.localized], 50)
+        return percentile(self.rotation_errors_deg[self.localized], 50)
 
     @property
     def recalls(self) -> tuple[float, ...]:
@@ -171,19 +173,24 @@ def evaluate(
     return Evaluation(tuple(queries), position_m, rotation_deg)
 
 
+def read_truth(path: Path) -> dict[str, Rigid3]:
+    """Read reference poses from a COLMAP model's folder or a pose file."""
+    if path.is_dir():
+        return {image.name: image.cam_from_world for image in read_model(path)}
+    return read_poses(path)
+
+
 def plot_paths(estimates: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], out: Path) -> None:
     """Draw the true path and the estimated positions from above (x, y) and from the side (x, z).
 
     Every pose of `truth` counts as a query, and their names have to sort along the path. The
     picture ends a little beyond the path; its legend counts the estimates outside of it.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ConfigError(
-            "drawing needs matplotlib; install it with: pip install 'trigpoint[plots]'"
-        ) from error
+    save_figure(draw_paths(estimates, truth), out)
+
+
+def draw_paths(estimates: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) -> Figure:
+    """Draw what `plot_paths` writes."""
     evaluation = evaluate(estimates, truth, sort_names(truth))
     path = Rigid3.stack(truth[name] for name in evaluation.names).center
     localized = compress(evaluation.names, evaluation.localized)
@@ -193,8 +200,7 @@ def plot_paths(estimates: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], out
     inches_a_metre = min(8.0 / width, 8.0 / sum(heights))
     width_in, height_in = width * inches_a_metre, sum(heights) * inches_a_metre
     # Wide enough for the title, and with room around the views for labels and legends.
-    figure = Figure((max(width_in, 5.0) + 2.0, height_in + 2.0), dpi=150, layout="compressed")
-    FigureCanvasAgg(figure)
+    figure = make_figure(max(width_in, 5.0) + 2.0, height_in + 2.0, layout="compressed")
     figure.suptitle(
         f"{evaluation.num_localized} of {evaluation.num_queries} localized, "
         f"median position error {_format_length(evaluation.median_position_m)}"
@@ -205,16 +211,13 @@ def plot_paths(estimates: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], out
     above.set_title("from above", loc="left", fontsize="medium")
     side.set_title("from the side", loc="left", fontsize="medium")
     side.set_xlabel("x (m)")
-    figure.legend(*side.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.legend(
+        *side.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
+    )
     figure.colorbar(
         points, ax=(above, side), label="position error (m)", extend="max", aspect=40, shrink=0.9
     )
-    if out.suffix.lower() not in PICTURES:
-        raise ConfigError(f"cannot draw {out}; name it {' or '.join(PICTURES)}")
-    try:
-        figure.savefig(out)
-    except OSError as error:
-        raise ConfigError(f"cannot write {out}: {error.strerror}") from error
+    return figure
 
 
 def _draw_view(
@@ -242,14 +245,14 @@ def _draw_view(
         cmap="viridis",
         vmin=0.0,
         vmax=max(np.percentile(errors_m, 95), 1e-6) if len(errors_m) else 1.0,
-        edgecolors="0.3",
+        edgecolors="0.5",
         linewidths=0.3,
         zorder=3,
         label=f"estimate ({len(positions)}{outside})",
     )
     axes.set(xlim=(lower[x], upper[x]), ylim=(lower[y], upper[y]), aspect="equal")
     axes.set_ylabel(f"{'xyz'[y]} (m)")
-    axes.grid(color="0.92")
+    axes.grid(color="0.5", alpha=0.2)
     axes.set_axisbelow(True)
     return points
 
@@ -271,7 +274,7 @@ def _format_length(metres: float) -> str:
     return f"{metres * 1e2:.1f} cm" if metres < 1 else f"{metres:.2f} m"
 
 
-def _percentile(errors: Array, q: float) -> float:
+def percentile(errors: Array, q: float) -> float:
     """Return numpy's default percentile, without its inf - inf = nan; inf of nothing."""
     if len(errors) == 0:
         return math.inf

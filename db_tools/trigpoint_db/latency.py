@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
-from mcap.records import Channel, Message
-from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC
 from rich.console import Console
 from rich.table import Table
 
 from trigpoint.errors import ConfigError
-from trigpoint_db.salvage import DAMAGE
+from trigpoint_db.statuses import read_statuses
 
 TOTAL = "total"
 
@@ -29,7 +25,7 @@ def read_stage_times(log: Path) -> dict[str, list[float]]:
     """
     times: dict[str, list[float]] = {}
     totals: list[float] = []
-    for topic, data in _read_statuses(log):
+    for topic, data in read_statuses(log):
         try:
             status = json.loads(data)
             stage_ms = {str(stage): float(ms) for stage, ms in status["stage_ms"].items()}
@@ -68,41 +64,3 @@ def print_latency(console: Console, stage_times: Mapping[str, Sequence[float]]) 
             table.add_section()
         table.add_row(stage, str(len(stage_times[stage])), f"{ms['p50']:.1f}", f"{ms['p99']:.1f}")
     console.print(table)
-
-
-def _read_statuses(log: Path) -> Iterator[tuple[str, bytes]]:
-    try:
-        with log.open("rb") as stream:
-            whole = _is_whole(stream)
-            try:
-                yield from _statuses(stream)
-            except DAMAGE as error:
-                if whole:
-                    detail = str(error) or type(error).__name__
-                    raise ConfigError(
-                        f"{log} is damaged ({detail}); try `trigpoint-db recover`"
-                    ) from error
-    except OSError as error:
-        raise ConfigError(f"cannot read {log}: {error.strerror}") from error
-
-
-def _is_whole(stream: BinaryIO) -> bool:
-    """Say whether the file has its end."""
-    size = stream.seek(0, 2)
-    stream.seek(max(0, size - len(MCAP0_MAGIC)))
-    end = stream.read()
-    stream.seek(0)
-    return end == MCAP0_MAGIC
-
-
-def _statuses(stream: BinaryIO) -> Iterator[tuple[str, bytes]]:
-    """Yield topic and data of the JSON messages on topics that end in `/status`."""
-    topics: dict[int, str] = {}
-    # The one of mcap's readers that gives what there is of a log without an end.
-    for record in StreamReader(stream, validate_crcs=True).records:
-        if isinstance(record, Channel) and record.message_encoding == "json":
-            topics[record.id] = record.topic
-        elif isinstance(record, Message):
-            topic = topics.get(record.channel_id, "")
-            if topic.endswith("/status"):
-                yield topic, record.data

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
+from trigpoint.frame import Prior
 from trigpoint.output import check_output
 from trigpoint.poses import format_pose
 from trigpoint.rigid import Rigid3
@@ -29,10 +32,10 @@ class Query:
 def read_names(path: Path) -> list[str]:
     """Read an image list: a name on each line, in the file's order; a query's camera is dropped."""
     names: dict[str, None] = {}
-    for where, line in _read_entries(path):
+    for where, line in read_entries(path):
         match = _QUERY.fullmatch(line)
         name = line if match is None else match["name"]
-        _check_new(where, name, names)
+        check_new(where, name, names)
         names[name] = None
     return list(names)
 
@@ -40,7 +43,7 @@ def read_names(path: Path) -> list[str]:
 def read_queries(path: Path) -> list[Query]:
     """Read `name MODEL width height params...` lines, in the file's order."""
     queries: dict[str, Query] = {}
-    for where, line in _read_entries(path):
+    for where, line in read_entries(path):
         match = _QUERY.fullmatch(line)
         if match is None:
             raise ConfigError(
@@ -50,32 +53,38 @@ def read_queries(path: Path) -> list[Query]:
             query = Query(match["name"], Camera.from_text(match["camera"]))
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from error
-        _check_new(where, query.name, queries)
+        check_new(where, query.name, queries)
         queries[query.name] = query
     return list(queries.values())
 
 
 def read_poses(path: Path) -> dict[str, Rigid3]:
     """Read `name qw qx qy qz tx ty tz` lines: cam_from_world by name, in the file's order."""
-    poses: dict[str, Rigid3] = {}
-    for where, line in _read_entries(path):
-        name, *numbers = line.rsplit(maxsplit=7)  # from the right: names may hold spaces
+    rows = read_rows(read_entries(path), "name qw qx qy qz tx ty tz")
+    return {name: pose_from_numbers(where, values) for where, name, values in rows}
+
+
+def write_queries(path: Path, queries: Iterable[Query]) -> None:
+    """Write what `read_queries` reads, in this order."""
+    queries = list(queries)
+    _check_names(path, (query.name for query in queries))
+    write_atomically(path, "".join(f"{q.name} {q.camera.to_text()}\n" for q in queries))
+
+
+def read_priors(path: Path) -> dict[str, Prior]:
+    """Read `name x y z radius` lines: where the camera of each query was about."""
+    priors: dict[str, Prior] = {}
+    for where, name, (x, y, z, radius) in read_rows(read_entries(path), "name x y z radius"):
         try:
-            values = [float(number) for number in numbers]
-        except ValueError:
-            values = []
-        if len(values) != 7:
-            raise ConfigError(f"{where}: expected 'name qw qx qy qz tx ty tz', not {line[:80]!r}")
-        _check_new(where, name, poses)
-        poses[name] = pose_from_numbers(where, values)
-    return poses
+            priors[name] = Prior((x, y, z), radius)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
+    return priors
 
 
 def write_poses(path: Path, poses: Mapping[str, Rigid3]) -> None:
     """Write what `read_poses` reads, sorted by name: equal poses give equal bytes."""
-    for name in poses:
-        if not is_writable(name) or name.startswith("#"):
-            raise ConfigError(f"the name {name!r} cannot stand in {path}; rename the image")
+    _check_names(path, poses)
     write_atomically(path, "".join(format_pose(name, poses[name]) for name in sort_names(poses)))
 
 
@@ -84,9 +93,21 @@ def format_numbers(*values: float) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
+def _check_names(path: Path, names: Iterable[str]) -> None:
+    for name in names:
+        if not is_writable(name) or name.startswith("#"):
+            raise ConfigError(f"the name {name!r} cannot stand in {path}; rename the image")
+
+
 def is_writable(name: str) -> bool:
     """Say whether a name survives being written to a line of text and read again."""
     return bool(name) and name.isprintable() and name == name.strip()
+
+
+def pose_from_center(where: str, wxyz: Sequence[float], center: Sequence[float]) -> Rigid3:
+    """Make cam_from_world of its quaternion and of the camera's position in the world."""
+    R = pose_from_numbers(where, [*wxyz, *center]).R
+    return Rigid3.from_center(R, np.array(center, dtype=np.float64))
 
 
 def pose_from_numbers(where: str, values: Sequence[float]) -> Rigid3:
@@ -136,10 +157,33 @@ def write_atomically(path: Path, text: str) -> None:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from error
 
 
-def _read_entries(path: Path) -> Iterator[tuple[str, str]]:
+def read_entries(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield as `read_lines` does, without comments and empty lines."""
     return ((where, line) for where, line in read_lines(path) if line and line[0] != "#")
 
 
-def _check_new(where: str, name: str, seen: Mapping[str, object]) -> None:
+def read_rows(
+    entries: Iterable[tuple[str, str]], layout: str
+) -> Iterator[tuple[str, str, list[float]]]:
+    """Yield where a line stands, its name and its numbers; `layout` names them, as 'name x y z'.
+
+    Lines of another layout and names that come twice are errors.
+    """
+    num_values, names = len(layout.split()) - 1, set[str]()
+    for where, line in entries:
+        name, *words = line.rsplit(maxsplit=num_values)  # from the right: names may hold spaces
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) != num_values:
+            raise ConfigError(f"{where}: expected {layout!r}, not {line[:80]!r}")
+        check_new(where, name, names)
+        names.add(name)
+        yield where, name, values
+
+
+def check_new(where: str, name: str, seen: Container[str]) -> None:
+    """Refuse a name that the file has had before."""
     if name in seen:
         raise ConfigError(f"{where}: {name} is in this file twice; remove one")

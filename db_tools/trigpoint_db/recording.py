@@ -40,6 +40,16 @@ class RecordedImage:
     cam_from_world: Rigid3 | None = None
 
 
+def list_images(folder: Path) -> list[str]:
+    """Return the names of the images in a folder, sorted."""
+    if not folder.is_dir():
+        raise ConfigError(f"no such folder: {folder}")
+    names = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in FORMATS)
+    if not names:
+        raise ConfigError(f"{folder} holds no images ({', '.join(FORMATS)})")
+    return names
+
+
 def write_recording(
     out: Path,
     images: Iterable[RecordedImage],

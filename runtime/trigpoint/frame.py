@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import date
 from enum import StrEnum
 from typing import Any
 
@@ -107,6 +108,53 @@ class PoseNoise:
         return np.repeat(np.column_stack([position, rotation]), 3, axis=1)
 
 
+@dataclass(frozen=True)
+class Session:
+    """A survey: images of a map that were taken on one occasion."""
+
+    name: str
+    date: date | None = None
+
+    def __post_init__(self) -> None:
+        if not (1 <= len(self.name) <= 100 and self.name.isprintable()):
+            raise ConfigError(
+                f"a session's name has 1 to 100 printable characters; it is {self.name[:100]!r}"
+            )
+
+    def __str__(self) -> str:
+        return self.name if self.date is None else f"{self.name} ({self.date})"
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Where a camera is about, by GPS or its last pose: a ball in the map's frame.
+
+    Parameters
+    ----------
+    center : (float, float, float)
+        In the map's unit.
+    radius : float
+        The same; large enough for the camera and for the images that see what it sees.
+    """
+
+    center: tuple[float, float, float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.center).all() and 0 < self.radius < np.inf):
+            raise ConfigError(
+                f"a prior position is three numbers and a radius above 0, not {self.center} and "
+                f"{self.radius}"
+            )
+
+    def contains(self, centers: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Say which centers (N, 3) are inside."""
+        inside: NDArray[np.bool_] = (
+            np.linalg.norm(centers - np.array(self.center), axis=1) <= self.radius
+        )
+        return inside
+
+
 @dataclass(frozen=True, eq=False)
 class Anchor:
     """A reference image of the map, with its known pose."""
@@ -175,6 +223,7 @@ class Statistics:
     turned_deg: int = 0  # counterclockwise, of the image that the features are of
     generator: str = ""  # which hypothesis was refined: "anchor_pairs" or "latent_points"
     anchors: tuple[str, ...] = ()  # names, best first
+    anchor_inliers: tuple[int, ...] = ()  # of the last pose, by anchor: those triangulated from it
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 
@@ -194,8 +243,6 @@ class Support:
         Which of them agree with the pose.
     anchors_from_world : Rigid3
         The anchors' poses (K,), in the order of `Statistics.anchors`.
-    anchor_inliers : (K,) int
-        How many of the inliers were triangulated from each; 0 where it has no say in the pose.
     """
 
     cam_from_world: Rigid3
@@ -203,7 +250,6 @@ class Support:
     points3d: NDArray[np.float64]
     inliers: NDArray[np.bool_]
     anchors_from_world: Rigid3
-    anchor_inliers: NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,17 @@ import cv2
 import numpy as np
 
 from trigpoint.database.reader import MapReader
-from trigpoint.frame import Frame, LocalFeatures, Localized, Lost, Reason, Result, Statistics
+from trigpoint.errors import ConfigError
+from trigpoint.frame import (
+    Frame,
+    LocalFeatures,
+    Localized,
+    Lost,
+    Prior,
+    Reason,
+    Result,
+    Statistics,
+)
 from trigpoint.geometry.joint_refinement import RefinedPose
 from trigpoint.geometry.triangulation import LatentPoints
 from trigpoint.models.features import FeatureModel
@@ -28,6 +38,7 @@ from trigpoint.stages import (
     Query,
     average_poses,
     calibrate_covariance,
+    count_by_anchor,
     count_support,
     estimate_relative_poses,
     extract_turned,
@@ -103,13 +114,26 @@ class Localizer:
         self.clock = clock
         self.matcher = matcher or MutualNearestNeighbors()
 
-    def localize(self, frame: Frame) -> Result:
+    def check_sessions(self) -> None:
+        """Raise ConfigError where the options name a session that the map does not have."""
+        known = {session.name for session in self.reader.sessions}
+        for option in ("prefer_sessions", "exclude_sessions"):
+            for name in getattr(self.options, option):
+                if name not in known:
+                    raise ConfigError(
+                        f"{option} has {name!r}, a session that the map does not have; "
+                        f"it has {', '.join(sorted(known)) or 'none'}"
+                    )
+
+    def localize(self, frame: Frame, prior: Prior | None = None) -> Result:
         """Estimate cam_from_world of a frame, with covariance, or say why not.
 
+        With a prior position, images from elsewhere are not tried first; they still count against a
+        pose that they would explain as well, so that a wrong prior makes no wrong pose.
         With `try_turned`, a frame that is lost as it is is also tried on its sides and upside down.
         """
         deadline = _Deadline(self.clock, self.options.max_latency_ms)
-        result = self._localize(frame, Statistics(), deadline)
+        result = self._localize(frame, prior, Statistics(), deadline)
         if isinstance(result, Localized) or not self.options.try_turned:
             return result
         if result.reason in (Reason.NO_MAP, Reason.TOO_DARK, Reason.FEW_FEATURES):
@@ -118,16 +142,18 @@ class Localizer:
             if deadline.is_over():
                 break
             start = Statistics(turned_deg=turned_deg, stage_ms=result.statistics.stage_ms)
-            turned = self._localize(frame, start, deadline)
+            turned = self._localize(frame, prior, start, deadline)
             if isinstance(turned, Localized):
                 return turned
         return result
 
     def solve(self, query: Query) -> Solution:
         """Solve for the pose with the anchors that a query is matched with, all at once."""
-        return self._solve(query, True, _Trace(None, Statistics()))
+        return self._solve(query, True, _Trace(self.clock, Statistics()))
 
-    def _localize(self, frame: Frame, statistics: Statistics, deadline: _Deadline) -> Result:
+    def _localize(
+        self, frame: Frame, prior: Prior | None, statistics: Statistics, deadline: _Deadline
+    ) -> Result:
         options, trace = self.options, _Trace(self.clock, statistics)
         if len(self.reader) == 0:
             return trace.lost(Reason.NO_MAP, "the map holds no image")
@@ -144,10 +170,16 @@ class Localizer:
 
         with trace.stage("retrieval"):
             indices, similarities = self.reader.search(
-                features.global_descriptor, options.num_anchors, options.anchor_diversity
+                features.global_descriptor,
+                options.num_anchors,
+                options.anchor_diversity,
+                prefer=options.prefer_sessions,
+                exclude=options.exclude_sessions,
+                prior=prior,
             )
         if len(indices) < 2:
-            return trace.lost(Reason.FEW_ANCHORS, "the map holds a single image")
+            detail = f"the map holds {len(indices) or 'no'} image that may be used"
+            return trace.lost(Reason.FEW_ANCHORS, detail)
         retrieved = dict(zip(indices.tolist(), similarities.tolist(), strict=True))
         return self._solve_in_rounds(frame, features, retrieved, trace, deadline)
 
@@ -209,7 +241,9 @@ class Localizer:
         points3d = solution.seen.points3d
         points3d = points3d[:: math.ceil(len(points3d) / MAX_SHOWN)]
         support = [retrieved.get(taken[view], 0.0) for view in np.unique(solution.seen.tracks.view)]
-        found, similarities = self.reader.search(features.global_descriptor, NUM_LOOK_ALIKE)
+        found, similarities = self.reader.search(
+            features.global_descriptor, NUM_LOOK_ALIKE, exclude=self.options.exclude_sessions
+        )
         num_alike = int((similarities > max(support) - MAX_LESS_ALIKE).sum())
         elsewhere: list[int] = []
         for i, index in enumerate(found.tolist()):
@@ -271,6 +305,7 @@ class Localizer:
             trace.note(
                 num_inliers=evidence.num_inliers,
                 num_rivals=evidence.num_rivals,
+                anchor_inliers=count_by_anchor(query, latent, refined.inliers),
                 spread_px=evidence.spread_px,
                 depth=evidence.depth,
                 confidence=confidence,

@@ -17,6 +17,8 @@ class LocalizerOptions:
     enough_position_std_ratio: float = 0.002  # of the inliers' median depth: certain
     max_latency_ms: float | None = None  # no more anchors where they would take longer
     anchor_diversity: float = 0.3  # of the likeness to a better anchor, taken off; see search
+    prefer_sessions: tuple[str, ...] = ()  # names; see search
+    exclude_sessions: tuple[str, ...] = ()
     max_keypoints: int = 1024
     # "best": latent points first; anchor pairs too where these have few supporters
     generator: Literal["best", "anchor_pairs", "latent_points"] = "best"
@@ -60,6 +62,10 @@ class LocalizerOptions:
                 raise ConfigError(f"{name} must be positive and below a million, not {value}")
         if not 0 <= self.anchor_diversity <= 1:
             raise ConfigError(f"anchor_diversity must be 0 to 1, not {self.anchor_diversity}")
+        if both := set(self.prefer_sessions) & set(self.exclude_sessions):
+            raise ConfigError(
+                f"session {min(both)!r} is in prefer_sessions and in exclude_sessions; remove one"
+            )
         for name in ("min_confidence", "enough_confidence"):
             if getattr(self, name) > 1:
                 raise ConfigError(f"{name} must be at most 1, not {getattr(self, name)}")

@@ -303,15 +303,12 @@ def refine(
 
 def find_support(query: Query, latent: LatentPoints, refined: RefinedPose) -> Support:
     """Gather what a refined pose rests on."""
-    tracks = latent.tracks
-    views = tracks.view[np.repeat(refined.inliers, tracks.lengths)]
     return Support(
         refined.cam_from_world,
         query.points[latent.point],
         refined.points3d,
         refined.inliers,
         query.views,
-        np.bincount(views, minlength=len(query.views)),
     )
 
 
@@ -319,6 +316,14 @@ def mean_distance(query: Query, latent: LatentPoints, cam_from_world: Rigid3) ->
     """Return the mean distance of the anchors that see the latent points."""
     centers = query.views[np.unique(latent.tracks.view)].center
     return float(np.linalg.norm(centers - cam_from_world.center, axis=1).mean())
+
+
+def count_by_anchor(
+    query: Query, latent: LatentPoints, inliers: NDArray[np.bool_]
+) -> tuple[int, ...]:
+    """Count for each anchor the latent points (M,), of those that are inliers, that it sees."""
+    seen = latent.tracks.view[np.repeat(inliers, latent.tracks.lengths)]
+    return tuple(np.bincount(seen, minlength=len(query.views)).tolist())
 
 
 def calibrate_covariance(

@@ -14,15 +14,9 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from trigpoint.camera import Camera
+from trigpoint.camera_messages import Calibration, Image, is_rectified
 from trigpoint.errors import SourceError
-from trigpointd.messages.images import (
-    Calibration,
-    Image,
-    is_rectified,
-    parse_calibration,
-    parse_image,
-    to_frame,
-)
+from trigpointd.messages.images import parse_calibration, parse_image, to_frame
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 TIME_NS = 1_700_000_000_123_456_789

@@ -13,16 +13,22 @@ from tests.conftest import Demo
 from tests.unit.graphs import for_one_size
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
+from trigpoint.database.replacing import compact_map
 from trigpoint.database.writer import MapWriter
-from trigpoint.frame import Frame, ModelIdentity
+from trigpoint.errors import ConfigError
+from trigpoint.frame import Frame, ModelIdentity, Session
 from trigpoint.images import read_gray
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
+from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
 from trigpoint_db.build import append_map, build_map
 from trigpoint_db.demo import CAMERA
-from trigpoint_db.importers.colmap import PosedImage, read_model
-from trigpointd.pipeline import Pipeline
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import read_model
+from trigpoint_db.maps import remove_images
+from trigpointd.config import Config, McapConfig
+from trigpointd.pipeline import Pipeline, open_pipeline
 from trigpointd.sources.base import Captured
 
 
@@ -69,7 +75,30 @@ def test_images_added_under_the_daemon_are_used_from_the_next_frame_on(
     append_map(map_path, survey[1:], demo.folder / "survey", model)
     after = status(pipeline, captured)
     assert after["status"] == "LOCALIZED"
-    assert after["map_generation"] == before["map_generation"] + 1
+    assert after["map_generation"] > before["map_generation"]
+
+
+def test_a_map_compacted_under_the_daemon_is_taken_up_with_the_next_frame(
+    pipeline: Pipeline,
+    captured: Captured,
+    demo: Demo,
+    map_path: Path,
+    model: FeatureModel,
+    survey: list[PosedImage],
+) -> None:
+    append_map(map_path, survey[1:], demo.folder / "survey", model)
+    before = status(pipeline, captured)
+    with MapReader.open(demo.map) as reader, MapWriter.open(map_path, model.identity) as writer:
+        for i in range(40):
+            writer.add_record(reader.record(0), f"unwanted/{i}")
+    remove_images(map_path, [f"unwanted/{i}" for i in range(40)])
+    size = map_path.stat().st_size
+    compact_map(map_path)
+    assert map_path.stat().st_size < size - 40 * 60_000
+    after = status(pipeline, captured)
+    assert (before["status"], after["status"]) == ("LOCALIZED", "LOCALIZED")
+    assert after["center"] == before["center"]
+    assert pipeline.reader.verify() == []
 
 
 def test_a_map_of_another_model_put_in_place_is_not_taken_up(
@@ -83,6 +112,42 @@ def test_a_map_of_another_model_put_in_place_is_not_taken_up(
     for _ in range(3):
         assert status(pipeline, captured)["reason"] == "FEW_ANCHORS"
     said = [record for record in caplog.records if "going on with the map" in record.message]
+    assert len(said) == 1
+
+
+def test_a_session_that_the_map_does_not_have_is_an_error_at_the_start(
+    demo: Demo, map_path: Path
+) -> None:
+    options = LocalizerOptions(exclude_sessions=("winter",))
+    source = McapConfig(type="mcap", path=demo.recording)
+    config = Config(map=map_path, source=source, localizer=options)
+    with (
+        pytest.raises(ConfigError, match="exclude_sessions has 'winter', a session that the map"),
+        open_pipeline(config),
+    ):
+        pass
+
+
+def test_a_session_that_the_map_has_no_longer_is_said_once_and_costs_nothing(
+    captured: Captured,
+    demo: Demo,
+    map_path: Path,
+    model: FeatureModel,
+    survey: list[PosedImage],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    winter = map_path.with_name("winter.tpmap")
+    build_map(winter, survey[1:], demo.folder / "survey", model, session=Session("winter"))
+    source = McapConfig(type="mcap", path=demo.recording)
+    options = LocalizerOptions(prefer_sessions=("winter",))
+    with open_pipeline(Config(map=winter, source=source, localizer=options)) as pipeline:
+        assert status(pipeline, captured)["status"] == "LOCALIZED"
+        append_map(map_path, survey[1:3], demo.folder / "survey", model)
+        map_path.rename(winter)
+        assert "anchors" in status(pipeline, captured)
+        append_map(winter, survey[3:], demo.folder / "survey", model)
+        assert status(pipeline, captured)["status"] == "LOCALIZED"
+    said = [record for record in caplog.records if "going on without it" in record.message]
     assert len(said) == 1
 
 

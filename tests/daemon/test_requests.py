@@ -25,7 +25,8 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import build_map
 from trigpoint_db.demo import CAMERA
-from trigpoint_db.importers.colmap import PosedImage, read_model
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import read_model
 from trigpointd.config import Config, McapConfig, RequestsConfig
 from trigpointd.pipeline import Output, Pipeline
 from trigpointd.request_queue import RequestQueue
@@ -123,6 +124,33 @@ def test_an_image_of_the_map_is_found_where_it_was_taken(
     assert np.linalg.eigvalsh(result["covariance"])[0] > 0
 
 
+def test_an_image_is_looked_for_around_a_position(
+    ask: Asker, demo: Demo, survey: list[PosedImage]
+) -> None:
+    image = survey[5]
+    x, y, z = image.cam_from_world.center
+    query = "localize", files(demo, image), "image/jpeg"
+    found = ask(*query, camera="phone", position=f"{x},{y},{z}", radius_m="2")
+    assert found["status"] == "LOCALIZED"
+    elsewhere = ask(*query, camera="phone", position=f"{x + 100},{y},{z}", radius_m="2")
+    assert (elsewhere["status"], elsewhere["reason"]) == ("LOST", "FEW_ANCHORS")
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        {"position": "1,2,3"},
+        {"radius_m": "5"},
+        {"position": "1,2", "radius_m": "5"},
+        {"position": "1,2,z", "radius_m": "5"},
+        {"position": "1,2,3", "radius_m": "far"},
+    ],
+)
+def test_a_position_that_cannot_be_read_is_an_error(ask: Asker, prior: dict[str, str]) -> None:
+    said = ask.error("localize", b"", "image/jpeg", camera="phone", **prior)
+    assert "write both, 'x,y,z' and a number" in said
+
+
 def test_an_image_that_is_not_found_is_an_answer_with_the_reason(ask: Asker) -> None:
     dark = cv2.imencode(".png", np.zeros((480, 640), np.uint8))[1].tobytes()
     result = ask("localize", dark, "image/png", camera="phone")
@@ -214,6 +242,21 @@ def test_an_image_is_added_found_and_removed_while_the_map_is_in_use(
     assert info["num_images"] == 12
     assert ask_small("localize", *query, camera="phone")["status"] == "LOST"
     assert "holds no image" in ask_small.error("map", action="remove", name=new.name)
+
+
+def test_an_image_is_added_to_a_session(
+    ask_small: Asker, demo: Demo, survey: list[PosedImage]
+) -> None:
+    image = survey[60]
+    asked: dict[str, Any] = {"name": image.name, "camera": "phone", "session": "spring"}
+    asked["cam_from_world"] = format_pose(image.cam_from_world)
+    payload = (files(demo, image), "image/jpeg")
+    said = ask_small.error("map", *payload, action="add", date="May 1st", **asked)
+    assert "date is 'May 1st'; write 2026-01-31" in said
+    without_name = {**asked, "session": ""}
+    assert "1 to 100" in ask_small.error("map", *payload, action="add", **without_name)
+    ask_small("map", *payload, action="add", date="2026-05-01", **asked)
+    assert ask_small("map")["sessions"] == ["spring (2026-05-01)"]
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,11 @@ import zenoh
 from tests.conftest import Demo
 from tests.daemon.test_service import run
 from tests.daemon.zenoh_daemon import Camera, get, open_session, running, wait_until
+from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError
 from trigpoint.models.features import FeatureModel
+from trigpoint_db.fleet.zenoh import Publisher
+from trigpoint_db.fleet.zenoh import open_session as open_fleet
 from trigpoint_db.importers.colmap import read_model
 from trigpointd.config import ZenohConfig, load_config
 from trigpointd.session import make_settings
@@ -24,10 +27,10 @@ from trigpointd.sinks.zenoh import ZenohSink
 DOC = Path(__file__).parents[2] / "docs" / "security.md"
 
 
-def block(language: str) -> str:
+def block(language: str, which: int = 1) -> str:
     if not DOC.is_file():
         pytest.skip("needs the checkout's docs/")
-    return DOC.read_text().split(f"```{language}\n")[1].split("```")[0]
+    return DOC.read_text().split(f"```{language}\n")[which].split("```")[0]
 
 
 def shell(folder: Path, script: str) -> None:
@@ -55,9 +58,11 @@ def docs_config(certificates: Path, port: int, **tls: Any) -> ZenohConfig:
     return ZenohConfig.model_validate({**tables, "tls": {**tables["tls"], **files, **tls}})
 
 
-def zenoh_file(name: str, certificates: Path, port: int) -> Path:
+def zenoh_file(name: str, certificates: Path, port: int, which: int = 1) -> Path:
     """Write the docs' settings for a program, beside the certificates."""
-    text = block("json5").replace("tls/drone1:7447", f"tls/127.0.0.1:{port}")
+    text = block("json5", which)
+    for address in ("drone1", "0.0.0.0"):
+        text = text.replace(f"tls/{address}:7447", f"tls/127.0.0.1:{port}")
     text = text.replace("ground", name)
     for file in ("ca.pem", f"{name}.pem", f"{name}.key"):
         text = text.replace(f'"{file}"', f'"{certificates / file}"')
@@ -167,6 +172,25 @@ def test_a_daemon_behind_a_router_takes_it_for_an_operator(
         wait_until(lambda: seen.count("trigpoint/test/pose") >= 2)
         ((is_good, text),) = get(router, "trigpoint/test/map")
         assert is_good, text
+
+
+def test_a_map_is_fetched_by_who_has_a_certificate(
+    demo: Demo, certificates: Path, tmp_path: Path, port: int
+) -> None:
+    key, out = "trigpoint/maps/room", tmp_path / "room.tpmap"
+    fetch = ("trigpoint_db", "fetch", key, "-o", out, "--timeout", "5", "--zenoh")
+    listening = open_fleet(zenoh_file("ground", certificates, port, which=2), None, None)
+    with Publisher(listening, key, demo.map):
+        stranger = run(*fetch, zenoh_file("drone1", certificates / "other", port))
+        assert stranger.returncode == 1
+        assert stranger.stderr.startswith("trigpoint-db: cannot open a Zenoh session with ")
+        assert stranger.stderr.count("\n") == 1
+        assert not out.exists()
+        done = run(*fetch, zenoh_file("drone1", certificates, port))
+        assert done.returncode == 0, done.stderr
+    with MapReader.open(demo.map) as ours, MapReader.open(out) as theirs:
+        assert theirs.verify() == []
+        assert theirs.names() == ours.names()
 
 
 @pytest.mark.parametrize(

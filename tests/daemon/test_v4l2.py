@@ -7,6 +7,7 @@ import contextlib
 import ctypes
 import errno
 import time
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -569,12 +570,16 @@ def test_it_can_be_ended_whatever_it_does_and_leaves_nothing_open(state: str) ->
     kernel = FakeKernel(*cameras[state])
     source = make_source(kernel, Backoff(3600, 3600))
 
+    async def take_all(frames: AsyncIterator[object]) -> None:
+        async for _ in frames:  # also that there are none yet
+            pass
+
     async def begin_and_end() -> None:
         async with contextlib.aclosing(source.frames()) as frames:
             if state == "holds a frame":
                 await anext(frames)
                 return
-            waiting = asyncio.create_task(anext(frames))
+            waiting = asyncio.create_task(take_all(frames))
             begun = kernel.streaming if cameras[state] else kernel.asked
             assert await asyncio.to_thread(begun.wait, TIMEOUT_S)
             waiting.cancel()

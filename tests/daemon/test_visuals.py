@@ -114,10 +114,11 @@ def test_anchors_stand_where_the_map_has_them(
     visuals: Visuals, outputs: list[Output], demo: Demo, model: FeatureModel
 ) -> None:
     result = localized(outputs[0])
-    counts = result.support.anchor_inliers.copy()
+    counts = np.array(result.statistics.anchor_inliers)
     counts[1] = 0
     used = counts > 0
-    result = replace(result, support=replace(result.support, anchor_inliers=counts))
+    statistics = replace(result.statistics, anchor_inliers=tuple(counts.tolist()))
+    result = replace(result, statistics=statistics)
     [entity] = draw(visuals, replace(outputs[0], result=result))["anchors"].entities
     assert entity.frame_id == "map"
     with MapReader.open(demo.map, model.identity) as reader:

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from tests.conftest import DATA
 from tests.daemon.test_service import run, subscriber, write_config
+from trigpoint.geometry.similarity import Similarity3
+from trigpoint.rigid import rotation_angle, rotation_from_vector
 from trigpoint_db.demo import BODY_FROM_CAMERA
-from trigpoint_db.importers.colmap import read_model
+from trigpoint_db.importers.colmap import read_model, write_model
 from trigpoint_db.poses import read_queries
 
 pytestmark = pytest.mark.skipif(
@@ -57,10 +60,7 @@ def test_real_queries_are_localized(
     folder = DATA / name
     queries = folder / f"queries{split}.txt"
     map_, poses, results = tmp_path / "m.tpmap", tmp_path / "poses.txt", tmp_path / "results.jsonl"
-    trigpoint_db(
-        "build", map_, "--colmap", folder / "sparse", "--images", folder / "images",
-        "--list", folder / f"map{split}.txt",
-    )  # fmt: skip
+    trigpoint_db("build", map_, folder, "--list", folder / f"map{split}.txt")
     trigpoint_db(
         "localize", map_, "--images", folder / "images", "--queries", queries,
         "--poses", poses, "--results", results,
@@ -79,10 +79,43 @@ def test_real_queries_are_localized(
     assert all(line["stage_ms"]["features"] > 0 for line in lines)
 
 
+@pytest.mark.parametrize("name", ["7scenes_redkitchen", "fox", "tnt_truck", "kitti_seq1"])
+def test_one_half_of_a_survey_comes_back_into_the_frame_of_the_other(
+    tmp_path: Path, name: str
+) -> None:
+    """Moved, turned and scaled by chance; off by less than 1 % of the scale and of the extent."""
+    folder = DATA / name
+    posed = read_model(folder / "sparse")
+    rng = np.random.default_rng(list(name.encode()))
+    turn = rotation_from_vector(rng.normal(0, 2, 3))
+    away = Similarity3(float(np.exp(rng.normal(0, 1.5))), turn, rng.normal(0, 50, 3))
+    moved = [replace(i, cam_from_world=away.move(i.cam_from_world)) for i in posed[1::2]]
+    write_model(tmp_path / "survey", moved)
+    (tmp_path / "map.txt").write_text("\n".join(image.name for image in posed[::2]))
+    map_ = tmp_path / "m.tpmap"
+    trigpoint_db(
+        "build", map_, folder / "sparse", "--images", folder / "images",
+        "--list", tmp_path / "map.txt",
+    )  # fmt: skip
+    report = json.loads(
+        trigpoint_db(
+            "align", map_, tmp_path / "survey", "--images", folder / "images",
+            "-o", tmp_path / "aligned", "--sample", 40, "--json",
+        )
+    )  # fmt: skip
+    assert abs(report["scale"] * away.scale - 1) < 0.01
+    assert np.rad2deg(rotation_angle(np.array(report["R"]) @ away.R)) < 0.5
+    truth = {image.name: image.cam_from_world.center for image in posed}
+    centers = np.array(list(truth.values()))
+    extent = np.linalg.norm(centers.max(axis=0) - centers.min(axis=0))
+    for image in read_model(tmp_path / "aligned"):
+        assert np.linalg.norm(image.cam_from_world.center - truth[image.name]) < 0.01 * extent
+
+
 def test_frames_of_another_place_are_refused(tmp_path: Path) -> None:
     kitchen, truck = DATA / "7scenes_redkitchen", DATA / "tnt_truck"
     map_, poses = tmp_path / "m.tpmap", tmp_path / "poses.txt"
-    trigpoint_db("build", map_, "--colmap", kitchen / "sparse", "--images", kitchen / "images")
+    trigpoint_db("build", map_, kitchen)
     said = trigpoint_db(
         "localize", map_, "--images", truck / "images", "--queries", truck / "queries.txt",
         "--poses", poses, code=1,
@@ -93,8 +126,7 @@ def test_frames_of_another_place_are_refused(tmp_path: Path) -> None:
 
 def test_a_second_process_receives_every_pose_of_the_kitchen(tmp_path: Path, port: int) -> None:
     kitchen = DATA / "7scenes_redkitchen"
-    sources = ["--colmap", kitchen / "sparse", "--images", kitchen / "images"]
-    trigpoint_db("build", tmp_path / "kitchen.tpmap", *sources, "--list", kitchen / "map.txt")
+    trigpoint_db("build", tmp_path / "kitchen.tpmap", kitchen, "--list", kitchen / "map.txt")
     trigpoint_db(
         "record", tmp_path / "kitchen.mcap", "--images", kitchen / "images",
         "--queries", kitchen / "queries.txt", "--truth", kitchen,

@@ -11,34 +11,12 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import Demo
-from trigpoint_db.cli import main
+from tests.unit.conftest import Run
+from trigpoint.database.writer import MapWriter
+from trigpoint.models.features import FeatureModel
 from trigpoint_db.demo import CAMERA
 from trigpoint_db.importers.colmap import read_model, write_model
 from trigpoint_db.poses import read_poses
-
-
-class Run:
-    """Runs the command within this process."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-        self._monkeypatch = monkeypatch
-        self._capsys = capsys
-
-    def __call__(self, *arguments: object) -> tuple[int, str, str]:
-        self._monkeypatch.setattr(sys, "argv", ["trigpoint-db", *map(str, arguments)])
-        self._capsys.readouterr()
-        with pytest.raises(SystemExit) as caught:
-            main()
-        code = caught.value.code
-        out, err = self._capsys.readouterr()
-        if isinstance(code, str):  # what sys.exit(message) prints once the interpreter ends
-            return 1, out, code
-        return int(code or 0), out, err
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    return Run(monkeypatch, capsys)
 
 
 @pytest.fixture
@@ -55,8 +33,7 @@ def place(demo: Demo, tmp_path: Path) -> Path:
 
 
 def build(place: Path, name: str = "m.tpmap", *more: object) -> list[object]:
-    sources = ["--colmap", place / "sparse", "--images", place / "images"]
-    return ["build", place / name, *sources, *more]
+    return ["build", place / name, place, *more]
 
 
 def test_from_images_to_numbers(run: Run, place: Path) -> None:
@@ -166,16 +143,26 @@ def test_a_recording_needs_cameras_for_its_images(run: Run, place: Path) -> None
     assert not out.exists()
 
 
-def test_what_a_killed_build_left_is_removed_by_the_next(run: Run, place: Path) -> None:
+def test_what_a_killed_command_left_is_removed_by_the_next(run: Run, place: Path) -> None:
     ended = subprocess.Popen(["true"])
     ended.wait()
-    leftover = place / f"m.tpmap.{ended.pid}.partial"
+    leftover = place / f"s.tpmap.{ended.pid}.partial"
     leftover.write_bytes(b"half a map")
-    of_another_build = place / f"m.tpmap.{os.getppid()}.partial"
-    of_another_build.write_bytes(b"half a map")
+    of_another = place / f"s.tpmap.{os.getppid()}.partial"
+    of_another.write_bytes(b"half a map")
     assert run(*build(place))[0] == 0
+    everywhere = "--box=-9,-9,-9,9,9,9"
+    assert run("split", place / "m.tpmap", everywhere, "-o", place / "s.tpmap")[0] == 0
     assert not leftover.exists()
-    assert of_another_build.exists()
+    assert of_another.exists()
+
+
+def test_a_build_killed_before_its_first_image_is_begun_anew(
+    run: Run, place: Path, model: FeatureModel
+) -> None:
+    MapWriter.create(place / "m.tpmap.partial", model.identity).close()
+    assert run(*build(place))[0] == 0
+    assert not list(place.glob("m.tpmap.*"))
 
 
 def test_sigterm_leaves_nothing_half_built(place: Path) -> None:
@@ -183,7 +170,7 @@ def test_sigterm_leaves_nothing_half_built(place: Path) -> None:
         [sys.executable, "-m", "trigpoint_db.cli", *map(str, build(place))],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    while process.poll() is None and not list(place.glob("m.tpmap.*.partial")):
+    while process.poll() is None and not list(place.glob("m.tpmap.partial")):
         time.sleep(0.01)
     process.terminate()
     process.wait(20)
@@ -241,3 +228,44 @@ def test_nothing_is_sent_home(demo: Demo, tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.stderr == b""
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_compact_map_is_built_and_added_to(run: Run, place: Path) -> None:
+    names = [image.name for image in read_model(place / "sparse")]
+    for path, part in (("first.txt", names[:8]), ("others.txt", names[8:])):
+        (place / path).write_text("\n".join(part))
+    first = build(place, "m.tpmap", "--list", place / "first.txt", "--profile", "compact")
+    assert run(*first)[0] == 0
+    more = build(place, "m.tpmap", "--list", place / "others.txt", "--append")
+    code, _, err = run(*more, "--profile", "standard")
+    assert code == 1
+    assert "is of the compact profile" in err
+    assert run(*more)[0] == 0
+    facts = json.loads(run("info", place / "m.tpmap", "--json")[1])
+    assert (facts["profile"], facts["num_images"]) == ("compact", 12)
+    assert facts["bytes"] < 12 * 30_000
+
+
+def test_queries_are_localized_around_prior_positions(run: Run, place: Path) -> None:
+    assert run(*build(place))[0] == 0
+    images = read_model(place / "sparse")[:2]
+    centers = [
+        image.cam_from_world.center + offset for image, offset in zip(images, (0, 500), strict=True)
+    ]
+    lines = [f"{i.name} {x} {y} {z} 5\n" for i, (x, y, z) in zip(images, centers, strict=True)]
+    (place / "priors.txt").write_text("".join(lines))
+    arguments = [
+        "localize", place / "m.tpmap", "--images", place / "images",
+        "--queries", place / "queries.txt", "--poses", place / "poses.txt", "--json",
+    ]  # fmt: skip
+    code, out, _ = run(*arguments, "--priors", place / "priors.txt")
+    assert code == 0
+    assert json.loads(out)["outcomes"] == {"LOCALIZED": 2, "FEW_ANCHORS": 1}
+    assert list(read_poses(place / "poses.txt")) == [
+        images[0].name,
+        read_model(place / "sparse")[2].name,
+    ]
+    (place / "priors.txt").write_text("other.jpg 0 0 0 1\n")
+    code, _, err = run(*arguments, "--priors", place / "priors.txt")
+    assert code == 1
+    assert "names none of the images" in err

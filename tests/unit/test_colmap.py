@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from trigpoint.camera import PARAMETERS, Camera
 from trigpoint.errors import ConfigError
 from trigpoint.rigid import Rigid3, rotation_from_vector
-from trigpoint_db.importers.colmap import PosedImage, read_model, write_model
+from trigpoint_db.importers.base import PosedImage
+from trigpoint_db.importers.colmap import read_model, write_model
 
 quick = settings(max_examples=25, deadline=None)
 

@@ -17,6 +17,7 @@ from trigpoint.camera import PARAMETERS, Camera
 from trigpoint.database import schema
 from trigpoint.database.ranking import POOL
 from trigpoint.database.reader import MapReader
+from trigpoint.database.rows import quantize_row
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import LocalFeatures, restore_descriptors
@@ -174,7 +175,7 @@ def test_search_equals_brute_force_on_the_stored_rows(
     stored = [
         scale * row.astype(np.float64)
         for scale, row in (
-            schema.quantize_row(make_features(index).global_descriptor) for index in range(300)
+            quantize_row(make_features(index).global_descriptor) for index in range(300)
         )
     ]
     query = make_features(seed).global_descriptor
@@ -217,7 +218,7 @@ def test_a_diverse_search_is_the_greedy_choice(
     with MapReader.open(path) as reader:
         pool, likeness = reader.search(query, POOL * k)
         found, _ = reader.search(query, k, diversity)
-    stored = [schema.quantize_row(make_features(i).global_descriptor) for i in pool.tolist()]
+    stored = [quantize_row(make_features(i).global_descriptor) for i in pool.tolist()]
     rows = np.array([scale * row.astype(np.float64) for scale, row in stored])
     chosen: list[int] = []
     while len(chosen) < min(k, 300):

@@ -18,6 +18,7 @@ import pytest
 from tests.unit.maps import MODEL, add, make_features, make_map, require_image
 from trigpoint.database import schema
 from trigpoint.database.reader import MapReader
+from trigpoint.database.rows import Row, encode_block, quantize_row
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import DatabaseError
 
@@ -107,7 +108,7 @@ def test_a_map_of_another_model_is_refused_and_both_are_named(tmp_path: Path) ->
 def test_a_map_of_another_format_is_refused(tmp_path: Path) -> None:
     path = make_map(tmp_path / "a.tpmap", 1)
     alter_entry(path, schema.METADATA_KEY, b'{"format": 9, "shards": []}')
-    with pytest.raises(DatabaseError, match="a map of format 9, and this version reads format 2"):
+    with pytest.raises(DatabaseError, match="a map of format 9, and this version reads format 4"):
         MapReader.open(path)
 
 
@@ -144,7 +145,7 @@ def test_a_flipped_bit_is_found_where_it_lies_and_nowhere_else(tmp_path: Path) -
 def test_a_flipped_bit_among_the_retrieval_rows_stops_the_search(tmp_path: Path) -> None:
     path = make_map(tmp_path / "a.tpmap", 20)
     query = make_features(7).global_descriptor
-    alter_byte(path, schema.quantize_row(query)[1].tobytes())
+    alter_byte(path, quantize_row(query)[1].tobytes())
     with MapReader.open(path) as reader:
         with pytest.raises(DatabaseError, match="retrieval block 0 is damaged"):
             reader.search(query, 1)
@@ -161,6 +162,10 @@ def test_damage_after_a_record_was_read_is_found_by_verify(tmp_path: Path) -> No
         assert reader.verify() == ["image 1 is damaged: its checksum does not match"]
 
 
+def row(session: int = 0) -> Row:
+    return Row(np.float32(1), np.zeros(3, np.float32), session, np.ones(32, np.int8))
+
+
 @pytest.mark.parametrize(
     ("key", "payload", "problem"),
     [
@@ -174,8 +179,13 @@ def test_damage_after_a_record_was_read_is_found_by_verify(tmp_path: Path) -> No
         (schema.block_key(0), None, "retrieval block 0 is missing"),
         (
             schema.block_key(0),
-            schema.encode_block(np.ones(2, np.float32), np.ones((2, 32), np.int8)),
+            encode_block([row(), row()]),
             "retrieval block 0 has 2 rows, not 3",
+        ),
+        (
+            schema.block_key(0),
+            encode_block([row(), row(session=1), row()]),
+            "retrieval block 0 has images of an unknown session",
         ),
         (schema.image_key(3), b"", "there are 12 entries where 11 belong"),
     ],

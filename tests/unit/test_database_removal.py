@@ -105,14 +105,40 @@ def test_a_name_that_is_not_there_is_an_error_and_changes_nothing(
     assert path.read_bytes() == before
 
 
+@pytest.mark.parametrize("in_one_commit", [True, False])
+def test_many_images_that_come_and_go_leave_a_map_that_opens(
+    tmp_path: Path, in_one_commit: bool
+) -> None:
+    """LMDB does not write pages that one commit takes and frees again, not even at the end."""
+    path = make_map(tmp_path / "a.tpmap", 3)
+    with MapWriter.open(path, MODEL) as writer:
+        for index in range(3, 40):
+            add(writer, index, features=make_features(index, 1000))
+        if not in_one_commit:
+            writer.commit()
+        for index in range(3, 40):
+            writer.remove(f"folder/{index}.png")
+    require_images(path, {0, 1, 2})
+
+
 def test_the_space_of_removed_images_is_used_again(tmp_path: Path) -> None:
-    path = make_map(tmp_path / "a.tpmap", 50)
+    path = make_map(tmp_path / "a.tpmap", 120)
     for _ in range(20):
         with MapWriter.open(path, MODEL) as writer:
             writer.remove("folder/7.png")
         with MapWriter.open(path, MODEL) as writer:
             add(writer, 7)
     size = path.stat().st_size
-    fresh = make_map(tmp_path / "b.tpmap", 50)
+    fresh = make_map(tmp_path / "b.tpmap", 120)
     assert size < 1.5 * fresh.stat().st_size
-    require_images(path, set(range(50)))
+    require_images(path, set(range(120)))
+
+
+def test_a_map_that_loses_many_images_at_once_can_be_written_again(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 300)
+    with MapWriter.open(path, MODEL) as writer:
+        for index in range(100):
+            writer.remove(f"folder/{index}.png")
+    with MapWriter.open(path, MODEL) as writer:
+        add(writer, 300)
+    require_images(path, set(range(100, 301)))

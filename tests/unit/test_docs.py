@@ -6,9 +6,14 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import typer.core
+import typer.main
 
 from trigpoint.frame import Reason, Statistics
 from trigpoint.options import LocalizerOptions
+from trigpoint_db.cli import app
+from trigpoint_db.importers.registry import IMPORTERS
+from trigpoint_db.public_sets import PUBLIC_SETS
 from trigpointd.config import Config, V4l2Config
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -18,7 +23,9 @@ pytestmark = pytest.mark.skipif(not DOCS.is_dir(), reason="needs the checkout's 
 def test_every_setting_of_the_localizer_is_listed_with_its_default() -> None:
     rows = re.findall(r"^\| `(\w+)` \| (\S+) \|", (DOCS / "configuration.md").read_text(), re.M)
     defaults = {
-        field.name: {"None": "off", "False": "false"}.get(str(field.default), str(field.default))
+        field.name: {"None": "off", "False": "false", "()": "[]"}.get(
+            str(field.default), str(field.default)
+        )
         for field in dataclasses.fields(LocalizerOptions)
     }
     assert {name: value.strip('"') for name, value in rows} == defaults
@@ -47,6 +54,27 @@ def test_every_reason_and_count_is_explained() -> None:
         assert f"`{reason}`" in text
     for field in dataclasses.fields(Statistics):
         assert f"`{field.name}`" in text
+
+
+def test_the_table_of_formats_has_all_of_them() -> None:
+    rows = re.findall(r"^\| `(\w+)` \|.*\| `(.*)` \|$", (DOCS / "maps.md").read_text(), re.M)
+    assert [name for name, _ in rows] == list(IMPORTERS)
+    commands = (DOCS / "maps.md").read_text()
+    assert all(f"`{public.command}`" in commands for public in PUBLIC_SETS)
+
+
+def test_the_commands_on_maps_and_data_sets_are_such() -> None:
+    text = (DOCS / "maps.md").read_text() + (DOCS.parent / "README.md").read_text()
+    group = typer.main.get_command(app)
+    assert isinstance(group, typer.core.TyperGroup)
+    lines = re.findall(r"trigpoint-db (\w[\w-]*)(.*?)[`\n]", text)
+    assert {"build", "queries", "submit"} <= {name for name, _ in lines}
+    for name, arguments in lines:
+        known = {option for parameter in group.commands[name].params for option in parameter.opts}
+        named = set(
+            re.findall(r"(?<![\w-])--?[a-z][\w-]*", re.sub(r"'.*?'|\".*?\"", "", arguments))
+        )
+        assert named <= known, (name, named - known)
 
 
 def test_relative_links_lead_somewhere() -> None:

@@ -3,7 +3,10 @@
 import itertools
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,9 +16,10 @@ from tests.conftest import Demo
 from tests.unit.scenes import generator
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
+from trigpoint.database.replacing import new_map
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError
-from trigpoint.frame import Frame, Localized, Lost, Reason, describe
+from trigpoint.frame import Frame, Localized, Lost, Prior, Reason, Session, describe
 from trigpoint.images import read_gray
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
@@ -80,9 +84,6 @@ def test_a_pose_names_the_points_and_anchors_it_rests_on(
     names = {reader.anchor(i).name: reader.anchor(i) for i in range(len(reader))}
     expected = np.array([names[name].cam_from_world.t for name in statistics.anchors])
     np.testing.assert_array_equal(support.anchors_from_world.t, expected)
-    assert support.anchor_inliers.sum() >= 2 * statistics.num_inliers
-    assert support.anchor_inliers.max() <= statistics.num_inliers
-    assert 2 <= (support.anchor_inliers > 0).sum() <= options.num_refined_anchors
 
 
 def test_a_refused_pose_names_them_too(
@@ -141,6 +142,67 @@ def test_anchors_are_added_until_the_pose_is_certain_or_the_time_is_up(
     assert num_anchors(model, reader, frame, 0.001, max_latency_ms=1000, **never) == 20
     assert num_anchors(model, reader, frame, 0.001, max_latency_ms=20, **never) == 6
     assert num_anchors(model, reader, frame, 10.0, max_latency_ms=1, **never) == 6
+
+
+def test_the_inliers_of_each_anchor_are_counted(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    for frame, _ in flight:
+        statistics = Localizer(model, reader).localize(frame).statistics
+        assert len(statistics.anchor_inliers) == len(statistics.anchors)
+        # Each inlier is seen by two anchors at least, and of an anchor at most all of them.
+        assert sum(statistics.anchor_inliers) >= 2 * statistics.num_inliers
+        assert max(statistics.anchor_inliers) <= statistics.num_inliers
+        num_used = sum(count > 0 for count in statistics.anchor_inliers)
+        assert 2 <= num_used <= LocalizerOptions().num_refined_anchors
+
+
+@pytest.fixture(scope="module")
+def two_sessions(
+    reader: MapReader, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[MapReader]:
+    """The room's map with every other image of another session."""
+    path = tmp_path_factory.mktemp("sessions") / "m.tpmap"
+    with new_map(path, reader.model) as writer:
+        for index in range(len(reader)):
+            session = Session("even" if index % 2 == 0 else "odd")
+            record = replace(reader.record(index), session=session)
+            writer.add_record(record, record.name)
+    with MapReader.open(path) as opened:
+        yield opened
+
+
+def shares_of_even(model: FeatureModel, reader: MapReader, frame: Frame, **asked: Any) -> float:
+    """What share of the anchors of a localized frame are of the session `even`."""
+    options = LocalizerOptions(first_anchors=20, **asked)
+    result = Localizer(model, reader, options).localize(frame)
+    assert isinstance(result, Localized)
+    names = reader.names()
+    is_even = [names.index(name) % 2 == 0 for name in result.statistics.anchors]
+    return sum(is_even) / len(is_even)
+
+
+def test_anchors_of_sessions_are_preferred_and_excluded(
+    model: FeatureModel, two_sessions: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    for frame, _ in flight:
+        share = partial(shares_of_even, model, two_sessions, frame)
+        assert share(exclude_sessions=("odd",)) == 1
+        assert share(exclude_sessions=("even",)) == 0
+        assert share(prefer_sessions=("odd",)) < share() < share(prefer_sessions=("even",))
+
+
+def test_a_map_of_which_everything_is_excluded_has_too_few_anchors(
+    model: FeatureModel, two_sessions: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    options = LocalizerOptions(exclude_sessions=("even", "odd"))
+    result = Localizer(model, two_sessions, options).localize(flight[0][0])
+    assert reason(result) is Reason.FEW_ANCHORS
+
+
+def test_a_session_is_not_both_preferred_and_excluded() -> None:
+    with pytest.raises(ConfigError, match="'old' is in prefer_sessions and in exclude_sessions"):
+        LocalizerOptions(prefer_sessions=("old",), exclude_sessions=("new", "old"))
 
 
 def reason(result: object) -> Reason:
@@ -258,3 +320,51 @@ def test_a_camera_on_its_side_is_found_where_asked_for(
     assert np.linalg.norm(result.cam_from_world.center - truth.center) < 0.02
     R = turn @ truth.R
     assert np.degrees(rotation_angle(result.cam_from_world.R @ R.T)) < 0.3
+
+
+def test_a_prior_position_leaves_out_anchors_from_elsewhere(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    centers = {name: reader.view(i)[1].center for i, name in enumerate(reader.names())}
+    frame, truth = flight[0]
+    prior = Prior(tuple(truth.center), 1.5)
+    result = Localizer(model, reader).localize(frame, prior)
+    assert isinstance(result, Localized), describe(result)
+    assert np.linalg.norm(result.cam_from_world.center - truth.center) < 0.02
+    distances = [np.linalg.norm(centers[a] - truth.center) for a in result.statistics.anchors]
+    assert max(distances) <= 1.5
+    assert sum(np.linalg.norm(c - truth.center) > 1.5 for c in centers.values()) > 10
+
+
+def test_a_wrong_prior_position_makes_no_wrong_pose(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]]
+) -> None:
+    localizer = Localizer(model, reader)
+    centers = [reader.view(index)[1].center for index in range(0, len(reader), 20)]
+    for frame, truth in flight:
+        for center in centers:
+            result = localizer.localize(frame, Prior(tuple(center), 1.0))
+            if isinstance(result, Localized):
+                assert np.linalg.norm(result.cam_from_world.center - truth.center) < 0.05
+    nowhere = localizer.localize(flight[0][0], Prior((500.0, 0.0, 0.0), 1.0))
+    assert isinstance(nowhere, Lost)
+    assert nowhere.reason == Reason.FEW_ANCHORS
+    assert "no image that may be used" in nowhere.detail
+
+
+def test_a_prior_position_does_not_decide_between_two_rooms_that_are_the_same(
+    model: FeatureModel, reader: MapReader, flight: list[tuple[Frame, Rigid3]], tmp_path: Path
+) -> None:
+    next_door = np.array([60.0, 0.0, 0.0])
+    path = tmp_path / "twice.tpmap"
+    with MapWriter.create(path, model.identity) as writer:
+        for offset in (np.zeros(3), next_door):
+            for index in range(len(reader)):
+                camera, pose = reader.view(index)
+                moved = Rigid3.from_center(pose.R, pose.center + offset)
+                writer.add(f"{index} {offset[0]}", camera, moved, reader.features(index))
+    with MapReader.open(path, model.identity) as twice:
+        for offset in (np.zeros(3), next_door):
+            frame, truth = flight[0]
+            prior = Prior(tuple(truth.center + offset), 20.0)
+            assert isinstance(Localizer(model, twice).localize(frame, prior), Lost)

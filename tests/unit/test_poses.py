@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
+from trigpoint.frame import Prior
 from trigpoint.rigid import Rigid3, rotation_from_vector
 from trigpoint_db.poses import (
     Query,
     read_names,
     read_poses,
+    read_priors,
     read_queries,
     sort_names,
     write_poses,
@@ -190,3 +192,27 @@ def test_names_sort_by_value_where_all_are_integers() -> None:
     assert sort_names(["10", "9", "-1"]) == ["-1", "9", "10"]
     assert sort_names(["10", "9", "a"]) == ["10", "9", "a"]
     assert sort_names([]) == []
+
+
+def test_priors_are_positions_with_a_radius_by_name(tmp_path: Path) -> None:
+    path = write(tmp_path / "priors.txt", "# GPS\na b.jpg 1 -2.5 3e2 10\nc.jpg 0 0 0 0.5\n")
+    assert read_priors(path) == {
+        "a b.jpg": Prior((1.0, -2.5, 300.0), 10.0),
+        "c.jpg": Prior((0.0, 0.0, 0.0), 0.5),
+    }
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("a 1 2 3", "expected 'name x y z radius'"),
+        ("a 1 2 x 4", "expected 'name x y z radius'"),
+        ("a 1 2 3 0", "a radius above 0"),
+        ("a 1 2 nan 1", "three numbers"),
+        ("b 1 2 3 4", "twice"),
+    ],
+)
+def test_an_error_in_priors_names_its_line(tmp_path: Path, line: str, message: str) -> None:
+    path = write(tmp_path / "priors.txt", f"b 1 2 3 4\n{line}\n")
+    with pytest.raises(ConfigError, match=f"priors.txt:2: .*{message}"):
+        read_priors(path)

@@ -10,8 +10,8 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from trigpoint.camera import Camera
+from trigpoint.camera_messages import Image
 from trigpoint.frame import Frame
-from trigpointd.messages.images import Image
 from trigpointd.sources.base import Channel, Message
 
 CAMERA_FRAME = "camera"

@@ -44,12 +44,12 @@ def show_anchors(result: Localized, pose: PoseStamped) -> SceneUpdate:
 
     Those that gave any are green, with a line to the camera, the others gray.
     """
-    support, depth = result.support, result.statistics.depth
+    support, statistics = result.support, result.statistics
     # A power of two, lest the anchors breathe from frame to frame.
-    size = 2.0 ** np.round(np.log2(_PYRAMID_RATIO * depth))
+    size = 2.0 ** np.round(np.log2(_PYRAMID_RATIO * statistics.depth))
     world_from_anchors = support.anchors_from_world.inverse()
     corners = world_from_anchors[:, None].apply(size * _PYRAMID)
-    used = support.anchor_inliers > 0
+    used = np.array(statistics.anchor_inliers) > 0
     pyramids = [
         _lines(
             corners[which].reshape(-1, 3),
@@ -71,7 +71,7 @@ def show_anchors(result: Localized, pose: PoseStamped) -> SceneUpdate:
             text=f"{name} ({count})",
         )
         for name, center, count in zip(
-            result.statistics.anchors, world_from_anchors.t, support.anchor_inliers, strict=True
+            statistics.anchors, world_from_anchors.t, statistics.anchor_inliers, strict=True
         )
     ]
     lines = [*pyramids, _lines(ends, rays, _FAINT_GREEN, width_px=1.0)]

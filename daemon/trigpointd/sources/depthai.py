@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 
 from trigpoint.camera import Camera
+from trigpoint.camera_messages import Calibration, Image
 from trigpoint.errors import ConfigError, SourceError
 from trigpointd.clock import WallClock
 from trigpointd.config import DepthaiConfig
 from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
-from trigpointd.messages.images import Calibration, Image, to_frame
+from trigpointd.messages.images import to_frame
 from trigpointd.sources.base import BadFrame, Captured, Message
 from trigpointd.sources.lookahead import read_ahead
 

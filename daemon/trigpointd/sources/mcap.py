@@ -10,13 +10,12 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from trigpoint.camera import Camera
+from trigpoint.camera_messages import check_time, choose_calibration, is_rectified
 from trigpoint.errors import ConfigError, SourceError
 from trigpoint.frame import Frame
 from trigpointd.messages.images import (
     CALIBRATION_TYPES,
     IMAGE_TYPES,
-    check_time,
-    is_rectified,
     parse_calibration,
     parse_image,
     to_frame,
@@ -217,31 +216,16 @@ def _choose_image_topic(recording: Recording, wanted: str | None) -> str:
 
 
 def _choose_calibration(recording: Recording, image_topic: str) -> Message:
-    """Return the first calibration of the camera of an image topic.
-
-    It lies in a namespace around the images (`/cam/camera_info` for `/cam/image_raw/compressed`),
-    the innermost if there are several; where that leaves a choice, its frame_id tells.
-    """
+    """Return the first calibration of the camera of an image topic."""
     found = sorted({c.topic for c in recording.channels if _type(c) in CALIBRATION_TYPES})
     firsts = {topic: message for topic in found if (message := recording.first(topic))}
-    path = _namespace(image_topic)
-    around = {t: len(_namespace(t)) for t in firsts if path[: len(_namespace(t))] == _namespace(t)}
-    topics = [t for t, depth in around.items() if depth == max(around.values())] or list(firsts)
-    if len(around) == 0 or len(topics) > 1:
+
+    def is_in_frame(topic: str) -> bool:
         image = recording.first(image_topic)
         frame_id = parse_image(*_type(image.channel), image.data).frame_id if image else ""
-        topics = [t for t in topics if frame_id and _frame_id(firsts[t]) == frame_id]
-    if len(topics) != 1:
-        raise SourceError(
-            f"no calibration for the images on {image_topic}, or more than one "
-            f"(calibrations on: {_listed(list(firsts))}); record the camera's "
-            "sensor_msgs/msg/CameraInfo or foxglove.CameraCalibration in the images' namespace"
-        )
-    return firsts[topics[0]]
+        return frame_id != "" and _frame_id(firsts[topic]) == frame_id
 
-
-def _namespace(topic: str) -> list[str]:
-    return topic.strip("/").split("/")[:-1]
+    return firsts[choose_calibration(image_topic, firsts, is_in_frame)]
 
 
 def _frame_id(calibration: Message) -> str:

@@ -14,13 +14,14 @@ from functools import partial
 
 import cv2
 
+from trigpoint.camera_messages import Image
 from trigpoint.errors import ConfigError, SourceError
 from trigpoint.frame import Frame
 from trigpoint.localizer import MIN_CONTRAST
 from trigpointd.clock import WallClock
 from trigpointd.config import V4l2Config
 from trigpointd.messages.foxglove import calibration_message, gray_image, image_message
-from trigpointd.messages.images import Image, parse_calibration, to_frame
+from trigpointd.messages.images import parse_calibration, to_frame
 from trigpointd.sources.base import BadFrame, Captured
 from trigpointd.sources.exposure import set_exposure
 from trigpointd.sources.lookahead import read_ahead

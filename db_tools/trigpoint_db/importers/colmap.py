@@ -16,6 +16,7 @@ from typing import Any
 from trigpoint.camera import PARAMETERS, Camera
 from trigpoint.errors import ConfigError
 from trigpoint.rigid import Rigid3
+from trigpoint_db.importers.base import Dataset, PosedImage
 from trigpoint_db.poses import (
     format_numbers,
     is_writable,
@@ -49,15 +50,6 @@ _POINT2D_BYTES = 24  # x, y: float64; point3D_id: uint64
 
 
 @dataclass(frozen=True, eq=False)
-class PosedImage:
-    """An image of the survey: its camera and where it stood."""
-
-    name: str
-    camera: Camera
-    cam_from_world: Rigid3
-
-
-@dataclass(frozen=True, eq=False)
 class _ImageEntry:
     """An image as the file has it; `where` is for messages."""
 
@@ -65,6 +57,19 @@ class _ImageEntry:
     name: str
     camera_id: int
     cam_from_world: Rigid3
+
+
+def detect(root: Path) -> bool:
+    """Say whether `root` holds a model, or is a folder of one."""
+    return root.is_dir() and _find_files(root) is not None
+
+
+def read(root: Path, *, images: Path | None = None) -> Dataset:
+    """Read the model in `root`; the images are in `images`, by default `root`/images."""
+    images = root / "images" if images is None else images
+    if not images.is_dir():
+        raise ConfigError(f"there is no folder {images}; say where the images are: --images")
+    return Dataset(images, read_model(root))
 
 
 def read_model(folder: Path) -> list[PosedImage]:
@@ -123,15 +128,22 @@ def _find_model(folder: Path) -> tuple[Path, Path]:
     """Return the files of the cameras and of the images; like COLMAP, binary ones first."""
     if not folder.is_dir():
         raise ConfigError(f"there is no folder {folder}; give that of a COLMAP model")
+    files = _find_files(folder)
+    if files is None:
+        raise ConfigError(
+            f"there is no COLMAP model in {folder}, its sparse or sparse/0: it is cameras.bin and "
+            "images.bin, or cameras.txt and images.txt"
+        )
+    return files
+
+
+def _find_files(folder: Path) -> tuple[Path, Path] | None:
     for candidate in (folder, folder / "sparse", folder / "sparse" / "0"):
         for suffix in (".bin", ".txt"):
             cameras, images = candidate / f"cameras{suffix}", candidate / f"images{suffix}"
             if cameras.is_file() and images.is_file():
                 return cameras, images
-    raise ConfigError(
-        f"there is no COLMAP model in {folder}, its sparse or sparse/0: it is cameras.bin and "
-        "images.bin, or cameras.txt and images.txt"
-    )
+    return None
 
 
 def _cameras_text(path: Path) -> Iterator[tuple[str, int, Camera]]:

@@ -15,7 +15,7 @@ from trigpoint.errors import ConfigError
 from trigpoint.frame import Frame
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import read_frame
-from trigpoint_db.importers.colmap import PosedImage
+from trigpoint_db.importers.base import PosedImage
 from trigpoint_db.synthetic import World, look_at, make_room, render, render_depth, survey_poses
 
 Array = NDArray[np.float64]
@@ -118,7 +118,7 @@ def survey_pairs(
     used = sorted({int(i) for k in drawn for i in (a[k], b[k])})
     views = {
         i: View(
-            read_frame(folder / posed[i].name, posed[i].camera, posed[i].name),
+            read_frame(folder, posed[i].name, posed[i].camera),
             posed[i].cam_from_world,
         )
         for i in used

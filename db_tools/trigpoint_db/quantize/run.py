@@ -16,7 +16,7 @@ from trigpoint.images import read_gray
 from trigpoint.models.local import FeatureNetwork
 from trigpoint.output import check_output
 from trigpoint_db.build import check_files
-from trigpoint_db.importers.colmap import PosedImage
+from trigpoint_db.importers.base import PosedImage
 from trigpoint_db.quantize.comparison import compare_networks
 from trigpoint_db.quantize.graph import FloatNetwork, Group
 from trigpoint_db.quantize.network import fit, load_network, make_input

@@ -30,6 +30,7 @@ Image = NDArray[np.uint8]
 NEAR_M = 0.02  # nothing nearer than this is drawn
 _SUPERSAMPLING = 2  # samples a pixel, in each direction
 _OVERLAP_M = 1e-5  # cells reach this far over their edges: rounding opens no gap between them
+_EDGE_ON_M = 1e-9  # a plane that passes this near to the camera is not seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,7 @@ def draw(
     """Yield what is seen, nearest cells first, and fill the zeroed `inverse_depth` (H, W)."""
     axes = rotate(cam_from_world.R, world.axes)
     origins = cam_from_world.apply(world.origins)
-    facing = np.einsum("si,si->s", axes[:, 2], origins) < 0
+    facing = np.einsum("si,si->s", axes[:, 2], origins) < -_EDGE_ON_M
     frames = np.stack([axes[:, 0], axes[:, 1], origins], axis=-1)
     homographies = np.linalg.inv(np.where(facing[:, None, None], frames, np.eye(3)))
     homographies = homographies.astype(rays.x.dtype)

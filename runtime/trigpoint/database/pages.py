@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import struct
 from bisect import bisect_left, bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import compress, pairwise
 
 import numpy as np
@@ -49,6 +49,14 @@ class Meta:
     depth: int
     root: int
     commit: int
+    body: bytes = field(repr=False)
+
+    def encode_pages(self) -> bytes:
+        """Write the first two pages of a file that has this root only."""
+        return b"".join(
+            (_HEADER.pack(slot, 0, _META, 0, 0) + self.body).ljust(self.page_bytes, b"\0")
+            for slot in (0, 1)
+        )
 
 
 def read_meta(fd: int, slot: int) -> Meta:
@@ -78,7 +86,7 @@ def _parse_meta(page: bytes) -> Meta:
         or not 1 <= last_page < 2**40
     ):
         raise DatabaseError(NOT_A_MAP)
-    return Meta(page_bytes, last_page + 1, depth, root, commit)
+    return Meta(page_bytes, last_page + 1, depth, root, commit, page[HEADER_BYTES:])
 
 
 class Tree:

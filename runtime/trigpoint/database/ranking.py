@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 Array32 = NDArray[np.float32]
 
+PREFERENCE = 0.1  # cosine that images of a preferred session are ahead by
 POOL = 4  # times as many as are asked for are looked at where they are to be diverse
 
 

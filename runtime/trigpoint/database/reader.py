@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
@@ -12,11 +12,21 @@ from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
 from trigpoint.database import schema
+from trigpoint.database.codec import Profile
 from trigpoint.database.pages import DamageError
-from trigpoint.database.ranking import POOL, choose_diverse, find_largest
+from trigpoint.database.ranking import POOL, PREFERENCE, choose_diverse
+from trigpoint.database.retrieval import Retrieval
 from trigpoint.database.snapshot import OVERWRITTEN, LockFileError, Snapshot, reporting
 from trigpoint.errors import DatabaseError
-from trigpoint.frame import Anchor, LocalFeatures, ModelIdentity, PoseNoise, restore_descriptors
+from trigpoint.frame import (
+    Anchor,
+    LocalFeatures,
+    ModelIdentity,
+    PoseNoise,
+    Prior,
+    Session,
+    restore_descriptors,
+)
 from trigpoint.rigid import Rigid3
 
 Array32 = NDArray[np.float32]
@@ -31,9 +41,12 @@ class MapReader:
 
     def __init__(self, path: Path, snapshot: Snapshot) -> None:
         self._path = path
-        self._snapshot: Snapshot | None = snapshot
-        self._metadata, self._file = snapshot.metadata, snapshot.file
         self._is_closed = False
+        self._take(snapshot)
+
+    def _take(self, snapshot: Snapshot) -> None:
+        self._retrieval: Retrieval | None = Retrieval(snapshot)
+        self._metadata, self._file = snapshot.metadata, snapshot.file
 
     @classmethod
     def open(cls, path: Path, model: ModelIdentity | None = None) -> Self:
@@ -42,15 +55,15 @@ class MapReader:
             return cls(path, Snapshot(path, model))
 
     @property
-    def _current(self) -> Snapshot:
-        if self._snapshot is None:
+    def _rows(self) -> Retrieval:
+        if self._retrieval is None:
             why = "this reader is closed" if self._is_closed else OVERWRITTEN
             raise DatabaseError(f"{self._path}: {why}")
-        return self._snapshot
+        return self._retrieval
 
     @contextmanager
     def _reading(self) -> Iterator[Snapshot]:
-        snapshot = self._current
+        snapshot = self._rows.snapshot
         with reporting(self._path):
             try:
                 yield snapshot
@@ -72,6 +85,21 @@ class MapReader:
         """How well the poses of the map agree; None where that was not measured."""
         return self._metadata.pose_noise
 
+    @property
+    def sessions(self) -> tuple[Session, ...]:
+        """The surveys that images of the map are of, or were."""
+        return self._metadata.sessions
+
+    @property
+    def profile(self) -> Profile:
+        """What it spends on an image."""
+        return self._metadata.profile
+
+    @property
+    def has_index(self) -> bool:
+        """Whether `search` compares with some of the images only."""
+        return self._metadata.index is not None
+
     def __len__(self) -> int:
         return self._metadata.num_images
 
@@ -80,6 +108,12 @@ class MapReader:
         with self._reading() as snapshot:
             images = (snapshot.get(schema.image_key(index)) for index in range(len(self)))
             return [schema.decode_name(image) for image in images]
+
+    def sessions_by_index(self) -> list[Session | None]:
+        """Return the session of each image, by index."""
+        table = (None, *self.sessions)
+        with self._reading():
+            return [table[i] for b in self._rows.blocks() for i in b.sessions.tolist()]
 
     def view(self, index: int) -> tuple[Camera, Rigid3]:
         """Return the camera of an image and its pose, cam_from_world."""
@@ -91,24 +125,50 @@ class MapReader:
         """Return an image with its features."""
         with self._reading() as snapshot:
             image = _image(snapshot, index)
+            payload = snapshot.get(schema.features_key(index))
             keypoints, descriptors = schema.decode_features(
-                image, snapshot.get(schema.features_key(index)), self.model.descriptor_dim
+                image, payload, self.model.descriptor_dim, self.profile
             )
         return Anchor(image.name, image.camera, image.cam_from_world, keypoints, descriptors)
+
+    def record(self, index: int) -> schema.Record:
+        """Return an image as it lies in the map, for another map."""
+        with self._reading() as snapshot:
+            _require_index(snapshot, index)
+            block, place = divmod(index, schema.BLOCK_ROWS)
+            row = self._rows.block(block).row(place)
+            image = bytes(snapshot.get(schema.image_key(index)))
+            return schema.Record(
+                schema.decode_name(memoryview(image)),
+                image,
+                bytes(snapshot.get(schema.features_key(index))),
+                row,
+                (None, *self.sessions)[row.session],
+                self.profile,
+            )
 
     def features(self, index: int) -> LocalFeatures:
         """Return an image's features as if it were a query; its scores are not in the map."""
         anchor = self.anchor(index)
-        with self._reading() as snapshot:
-            (described,) = _descriptors(snapshot, np.array([index]))
+        with self._reading():
+            (described,) = self._rows.descriptors(np.array([index]))
         scores = np.zeros(len(anchor.keypoints), np.float32)
         descriptors = restore_descriptors(anchor.descriptors)
         return LocalFeatures(anchor.keypoints, descriptors, scores, described)
 
     def search(
-        self, global_descriptor: Array32, k: int, diversity: float = 0.0
+        self,
+        global_descriptor: Array32,
+        k: int,
+        diversity: float = 0.0,
+        *,
+        prefer: Collection[str] = (),
+        exclude: Collection[str] = (),
+        prior: Prior | None = None,
     ) -> tuple[NDArray[np.intp], Array32]:
-        """Find the images that look most alike, by comparing with all.
+        """Find the images that look most alike.
+
+        Without an index by comparing with all; with one most of these are found.
 
         Where many images show the same view, and look like the query by accident, they would leave
         no place for the one that is right: `choose_diverse` prefers others.
@@ -121,11 +181,18 @@ class MapReader:
             How many, at the most.
         diversity : float
             See `choose_diverse`; the choice is among the `POOL` k most similar images.
+        prefer, exclude : collection of str
+            Names of sessions: images of the former come as if their cosine were larger by
+            `PREFERENCE`, those of the latter not at all. Names that the map does not have are of
+            no effect.
+        prior : Prior, optional
+            Images whose cameras were elsewhere do not come.
 
         Returns
         -------
         indices : (k,) int
-            Best first: without diversity the most similar, equally similar ones by index.
+            Best first: without diversity and preferences the most similar, equally similar ones by
+            index.
         similarities : (k,) float32
             Cosines.
         """
@@ -135,17 +202,23 @@ class MapReader:
                 f"{self._path}: searched for numbers {global_descriptor.shape}; "
                 f"its global descriptors are ({dim},), all finite"
             )
-        similarities = np.empty(len(self), np.float32)
-        with self._reading() as snapshot:
-            for block, start in enumerate(range(0, len(similarities), schema.BLOCK_ROWS)):
-                part = similarities[start : start + schema.BLOCK_ROWS]
-                scales, rows = _rows(snapshot, block)
-                np.multiply(rows.astype(np.float32) @ global_descriptor, scales, out=part)
-            best = find_largest(similarities, k if diversity == 0 else POOL * k)
+        bonus = _bonus(self.sessions, prefer, exclude)
+        num = k if diversity == 0 else POOL * k
+        with self._reading():
+            found = self._rows.search(global_descriptor, num, bonus, prior)
             if diversity > 0:
-                alike = _descriptors(snapshot, best)
-                best = best[choose_diverse(similarities[best], alike @ alike.T, k, diversity)]
-        return best, similarities[best]
+                alike = self._rows.descriptors(found.indices)
+                chosen = choose_diverse(found.scores, alike @ alike.T, k, diversity)
+                return found.indices[chosen], found.similarities[chosen]
+        return found.indices, found.similarities
+
+    def copy_to(self, fd: int) -> None:
+        """Write the snapshot to an empty file, as a map of its own.
+
+        What two snapshots of a file have in common lies in the same places of their copies.
+        """
+        with self._reading() as snapshot:
+            snapshot.copy_to(fd)
 
     def refresh(self) -> bool:
         """Move to the newest snapshot, also of another file renamed into place; True if it differs.
@@ -156,14 +229,14 @@ class MapReader:
             raise DatabaseError(f"{self._path}: this reader is closed")
         before = self._file, self._metadata
         with reporting(self._path):
-            if self._snapshot is not None and self._snapshot.is_newest(self._path):
+            if self._retrieval and self._retrieval.snapshot.is_newest(self._path):
                 return False
             new = self._open_newest()
-        if self._snapshot is not None and new.state == self._snapshot.state:
+        if self._retrieval and new.state == self._retrieval.snapshot.state:
             new.close()
         else:
             self._let_go()
-            self._snapshot, self._metadata, self._file = new, new.metadata, new.file
+            self._take(new)
         return (self._file, self._metadata) != before
 
     def _open_newest(self) -> Snapshot:
@@ -191,7 +264,7 @@ class MapReader:
     def verify(self) -> list[str]:
         """Check everything, whether checked before or not, and list what is wrong."""
         problems: list[str] = []
-        num_blocks = -(-len(self) // schema.BLOCK_ROWS)
+        rows = self._rows
         with self._reading() as snapshot:
             snapshot.forget_checks()
             for index in range(len(self)):
@@ -200,10 +273,15 @@ class MapReader:
                     snapshot.get(schema.features_key(index))
                     if schema.decode_index(snapshot.get(schema.name_key(name))) != index:
                         problems.append(f"the name {name!r} does not lead to image {index}")
-            for block in range(num_blocks):
+            for block in range(rows.num_blocks):
                 with _collecting(problems):
-                    _rows(snapshot, block)
-            found, wanted = snapshot.count_entries(), 1 + 3 * len(self) + num_blocks
+                    rows.block(block)
+            wanted = 1 + 3 * len(self) + rows.num_blocks
+            if (inverted := snapshot.metadata.index) is not None:
+                wanted += 1 + inverted.num_lists
+                with _collecting(problems):
+                    rows.check_index(inverted)
+            found = snapshot.count_entries()
             if found != wanted:
                 problems.append(f"there are {found} entries where {wanted} belong")
         return list(dict.fromkeys(problems))  # a page is met more than once
@@ -214,9 +292,9 @@ class MapReader:
         self._is_closed = True
 
     def _let_go(self) -> None:
-        if self._snapshot is not None:
-            self._snapshot.close()
-        self._snapshot = None
+        if self._retrieval is not None:
+            self._retrieval.snapshot.close()
+        self._retrieval = None
 
     def __enter__(self) -> Self:
         return self
@@ -233,29 +311,22 @@ def _collecting(problems: list[str]) -> Iterator[None]:
         problems.append(str(error))
 
 
-def _image(snapshot: Snapshot, index: int) -> schema.Image:
+def _require_index(snapshot: Snapshot, index: int) -> None:
     if not 0 <= index < snapshot.metadata.num_images:
         raise DatabaseError(f"no image {index} among {snapshot.metadata.num_images}")
+
+
+def _image(snapshot: Snapshot, index: int) -> schema.Image:
+    _require_index(snapshot, index)
     return schema.decode_image(snapshot.get(schema.image_key(index)))
 
 
-def _rows(snapshot: Snapshot, block: int) -> tuple[Array32, NDArray[np.int8]]:
-    metadata = snapshot.metadata
-    payload = snapshot.get(schema.block_key(block))
-    scales, rows = schema.decode_block(payload, metadata.model.global_dim)
-    wanted = min(metadata.num_images - block * schema.BLOCK_ROWS, schema.BLOCK_ROWS)
-    if len(rows) != wanted:
-        raise DamageError(f"retrieval block {block} has {len(rows)} rows, not {wanted}")
-    return scales, rows
-
-
-def _descriptors(snapshot: Snapshot, indices: NDArray[np.intp]) -> Array32:
-    """Return the global descriptors of some images (K, G)."""
-    descriptors = np.empty((len(indices), snapshot.metadata.model.global_dim), np.float32)
-    block_of = indices // schema.BLOCK_ROWS
-    for block in np.unique(block_of):
-        scales, rows = _rows(snapshot, int(block))
-        here = block_of == block
-        inside = indices[here] % schema.BLOCK_ROWS
-        descriptors[here] = rows[inside] * scales[inside, None]
-    return descriptors
+def _bonus(
+    sessions: tuple[Session, ...], prefer: Collection[str], exclude: Collection[str]
+) -> Array32:
+    """Return what each session, from none on, adds to a similarity (S + 1,)."""
+    bonus = [0.0] + [
+        -np.inf if session.name in exclude else PREFERENCE * (session.name in prefer)
+        for session in sessions
+    ]
+    return np.array(bonus, np.float32)

@@ -1,4 +1,4 @@
-r"""How a map lies on disk: the only place that knows bytes.
+r"""How a map lies on disk: with `rows` and `codec` the only place that knows bytes.
 
 A map is one LMDB file (data format of LMDB 0.9, 64 bit). Numbers are little-endian, in keys
 big-endian so that they sort. Each value begins with the CRC-32 of its key and of all that follows:
@@ -6,14 +6,19 @@ neither an altered byte nor a value under a wrong key goes unnoticed.
 
     key                        value after the CRC
     00                         metadata, JSON
+    00 01                      centroids of the index, where there is one: (L, G) f2
+    00 02 list u32             a list of it: indices (n,) u4, then as a block
     01 name                    index of the image, u32
-    02 block u32               up to 256 retrieval rows: scales (n,) f4, rows (n, G) i1
+    02 block u32               up to 256 retrieval rows: scales (n,) f4, camera centers (n, 3) f4,
+                               sessions (n,) u2, numbers (n, G) i1
     03 index u32 00            an image: pose, camera, sizes, its first keypoints, name
-    03 index u32 01            its features: other keypoints (N - j, 2) u2, descriptors (N, D) i1
+    03 index u32 01            its features: other keypoints (N - j, 2) u2, descriptors
 
 Keypoints are fixed point, `x = u step - 0.5` with `step = max(width, height) / 65535` px.
-Descriptors are `i 4 / (127 sqrt(D))`: numbers of a unit vector have a standard deviation of
-1 / sqrt(D). Retrieval rows have a scale each, which makes the stored row a unit vector.
+Descriptors are (N, D) i1, `i 4 / (127 sqrt(D))`: numbers of a unit vector have a standard deviation
+of 1 / sqrt(D); those of a compact map are as `codec` makes them. Retrieval rows have a scale each,
+which makes the stored row a unit vector. Their sessions are places in the metadata's list, from 1
+on; 0 is no session.
 """
 
 from __future__ import annotations
@@ -23,30 +28,53 @@ import json
 import struct
 import zlib
 from dataclasses import dataclass
+from datetime import date
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trigpoint.camera import PARAMETERS, Camera
+from trigpoint.database.codec import (
+    Profile,
+    decode_descriptors,
+    descriptor_bytes,
+    encode_descriptors,
+)
 from trigpoint.database.pages import HEADER_BYTES, DamageError
+from trigpoint.database.rows import Row
 from trigpoint.errors import ConfigError, DatabaseError
-from trigpoint.frame import LocalFeatures, ModelIdentity, PoseNoise, quantize_descriptors
+from trigpoint.frame import (
+    LocalFeatures,
+    ModelIdentity,
+    PoseNoise,
+    Session,
+    restore_descriptors,
+)
 from trigpoint.rigid import Rigid3
 
 Array32 = NDArray[np.float32]
 
-FORMAT = 2
+FORMAT = 4
 BLOCK_ROWS = 256
 MAX_NAME_BYTES = 500  # LMDB's keys end at 511
 MAX_KEYPOINTS = 65_535
 MAX_CAMERA_PARAMETERS = 8
+MAX_SESSIONS = 65_535
+NO_SESSION = 0
 
 METADATA_KEY = b"\x00"
+CENTROIDS_KEY = b"\x00\x01"
 _CRC = struct.Struct("<I")
 _INDEX = struct.Struct("<I")
 # Quaternion and t, parameters, model; width, height, keypoints; how many of these lie here.
 _IMAGE = struct.Struct(f"<7d {MAX_CAMERA_PARAMETERS}d 24s III H")
+_NUM_INLINE = struct.Struct("<H")  # its end
 _MAX_INLINE_BYTES = 1024
+
+
+def list_key(number: int) -> bytes:
+    """Key of a list of the index."""
+    return struct.pack(">BBI", 0, 2, number)
 
 
 def name_key(name: str) -> bytes:
@@ -73,6 +101,10 @@ def describe_key(key: bytes) -> str:
     """Say for people what lies under a key."""
     if key == METADATA_KEY:
         return "the map's metadata"
+    if key == CENTROIDS_KEY:
+        return "the centroids of the index"
+    if key[0] == 0:
+        return f"list {int.from_bytes(key[2:], 'big')} of the index"
     if key[0] == 1:
         return f"the index entry of {key[1:].decode()!r}"
     number = int.from_bytes(key[1:5], "big")
@@ -95,6 +127,15 @@ def unseal(key: bytes, value: memoryview | None, *, check: bool = True) -> memor
 
 
 @dataclass(frozen=True)
+class InvertedFile:
+    """An index of the first rows of a map, as they were when it was made."""
+
+    num_rows: int
+    num_lists: int
+    moved: tuple[int, ...] = ()  # rows of these that others have taken the place of since
+
+
+@dataclass(frozen=True)
 class Metadata:
     """What a map says of itself."""
 
@@ -102,10 +143,14 @@ class Metadata:
     generation: int = 0  # rises with each commit
     num_images: int = 0
     pose_noise: PoseNoise | None = None  # as measured
+    sessions: tuple[Session, ...] = ()
+    profile: Profile = Profile.STANDARD
+    index: InvertedFile | None = None
 
     def encode(self) -> bytes:
         """Write JSON."""
-        return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}).encode()
+        fields = {"format": FORMAT, **dataclasses.asdict(self)}
+        return json.dumps(fields, default=date.isoformat).encode()
 
     @classmethod
     def decode(cls, payload: bytes) -> Metadata:
@@ -116,14 +161,36 @@ class Metadata:
                 f"a map of format {found}, and this version reads format {FORMAT}; "
                 "rebuild it with `trigpoint-db build` or use the version that made it"
             )
-        noise = fields.get("pose_noise")
+        noise, sessions, index = (fields[key] for key in ("pose_noise", "sessions", "index"))
+        profile = fields["profile"]
+        if profile not in list(Profile):
+            raise DatabaseError(f"a map of profile {profile!r}; use the version that made it")
         return cls(
             **fields
             | {
                 "model": ModelIdentity(**fields["model"]),
                 "pose_noise": None if noise is None else PoseNoise(**noise),
+                "sessions": tuple(
+                    Session(s["name"], s["date"] and date.fromisoformat(s["date"]))
+                    for s in sessions
+                ),
+                "profile": Profile(profile),
+                "index": index
+                and InvertedFile(index["num_rows"], index["num_lists"], tuple(index["moved"])),
             }
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """An image as it lies in a map, ready for another one; `row.session` is the former's."""
+
+    name: str
+    image: bytes
+    features: bytes
+    row: Row
+    session: Session | None
+    profile: Profile  # of its descriptors
 
 
 def encode_index(index: int) -> bytes:
@@ -149,22 +216,15 @@ class Image:
 
 
 def encode_image(
-    name: str, camera: Camera, cam_from_world: Rigid3, features: LocalFeatures
+    name: str,
+    camera: Camera,
+    cam_from_world: Rigid3,
+    features: LocalFeatures,
+    profile: Profile = Profile.STANDARD,
 ) -> tuple[bytes, bytes]:
-    """Write an image and its features.
-
-    LMDB gives a large value whole pages. Where the features would hang over their last page but a
-    little (1024 x 64 are 17 pages and 20 bytes), the first keypoints go to the image instead, which
-    lies in the tree's own pages.
-    """
-    num_keypoints = len(features)
+    """Write an image and its features."""
     step = _keypoint_step_px(camera)
     keypoints = np.rint((features.keypoints.astype(np.float64) + 0.5) / step).astype("<u2")
-    descriptors = quantize_descriptors(features.descriptors)
-
-    stored = HEADER_BYTES + _CRC.size + keypoints.nbytes + descriptors.nbytes
-    overhang = stored % 4096 if stored > 4096 else 0
-    num_inline = -(-overhang // 4) if overhang <= min(_MAX_INLINE_BYTES, keypoints.nbytes) else 0
     header = _IMAGE.pack(
         *cam_from_world.quaternion,
         *cam_from_world.t,
@@ -172,19 +232,53 @@ def encode_image(
         camera.model.encode(),
         camera.width,
         camera.height,
-        num_keypoints,
-        num_inline,
+        len(features),
+        0,
     )
+    return _divide(header, name, keypoints, encode_descriptors(features.descriptors, profile))
+
+
+def _divide(
+    header: bytes, name: str, keypoints: NDArray[np.uint16], descriptors: bytes
+) -> tuple[bytes, bytes]:
+    """Put the keypoints (N, 2) where they take the least space.
+
+    LMDB gives a large value whole pages. Where the features would hang over their last page but a
+    little (1024 x 64 are 17 pages and 20 bytes), the first keypoints go to the image instead, which
+    lies in the tree's own pages.
+    """
+    stored = HEADER_BYTES + _CRC.size + keypoints.nbytes + len(descriptors)
+    overhang = stored % 4096 if stored > 4096 else 0
+    num_inline = -(-overhang // 4) if overhang <= min(_MAX_INLINE_BYTES, keypoints.nbytes) else 0
+    header = header[: -_NUM_INLINE.size] + _NUM_INLINE.pack(num_inline)
     return (
         header + keypoints[:num_inline].tobytes() + name.encode(),
-        keypoints[num_inline:].tobytes() + descriptors.tobytes(),
+        keypoints[num_inline:].tobytes() + descriptors,
     )
+
+
+def recode(record: Record, dim: int, profile: Profile) -> Record:
+    """Write an image with descriptors of `dim` numbers as a map of another profile has it."""
+    if record.profile == profile:
+        return record
+    image = decode_image(memoryview(record.image))
+    keypoints, descriptors = _split(image, memoryview(record.features), dim, record.profile)
+    numbers = restore_descriptors(decode_descriptors(descriptors, dim, record.profile))
+    header, encoded = record.image[: _IMAGE.size], encode_descriptors(numbers, profile)
+    written, features = _divide(header, image.name, keypoints, encoded)
+    return dataclasses.replace(record, image=written, features=features, profile=profile)
 
 
 def decode_name(payload: memoryview) -> str:
     """Read an image's name only."""
     num_inline = _IMAGE.unpack_from(payload)[-1]
     return bytes(payload[_IMAGE.size + 4 * num_inline :]).decode()
+
+
+def rename_image(payload: bytes, name: str) -> bytes:
+    """Write an image under another name."""
+    num_inline = _IMAGE.unpack_from(payload)[-1]
+    return payload[: _IMAGE.size + 4 * num_inline] + name.encode()
 
 
 def decode_image(payload: memoryview) -> Image:
@@ -207,38 +301,24 @@ def decode_image(payload: memoryview) -> Image:
 
 
 def decode_features(
-    image: Image, payload: memoryview, dim: int
+    image: Image, payload: memoryview, dim: int, profile: Profile = Profile.STANDARD
 ) -> tuple[Array32, NDArray[np.int8]]:
     """Read keypoints (N, 2) in px and quantized descriptors (N, D)."""
+    fixed, descriptors = _split(image, payload, dim, profile)
+    keypoints = (fixed * _keypoint_step_px(image.camera) - 0.5).astype(np.float32)
+    return keypoints, decode_descriptors(descriptors, dim, profile)
+
+
+def _split(
+    image: Image, payload: memoryview, dim: int, profile: Profile
+) -> tuple[NDArray[np.uint16], memoryview]:
+    """Return an image's keypoints (N, 2), fixed point, and its descriptors as they lie."""
     split = 4 * (image.num_keypoints - len(image.first_keypoints))
-    if len(payload) != split + dim * image.num_keypoints:
+    if len(payload) != split + descriptor_bytes(dim, profile) * image.num_keypoints:
         raise DamageError(f"{image.name!r} has features that are not its own")
     others = np.frombuffer(payload[:split], "<u2").reshape(-1, 2)
-    fixed = np.concatenate([image.first_keypoints, others])
-    keypoints = (fixed * _keypoint_step_px(image.camera) - 0.5).astype(np.float32)
-    # A copy: the mapping is the snapshot's, which ends.
-    return keypoints, np.frombuffer(payload[split:], np.int8).reshape(-1, dim).copy()
+    return np.concatenate([image.first_keypoints, others]), payload[split:]
 
 
 def _keypoint_step_px(camera: Camera) -> float:
     return max(camera.width, camera.height) / 65_535
-
-
-def quantize_row(row: Array32) -> tuple[np.float32, NDArray[np.int8]]:
-    """Return the scale and the int8 numbers (G,) of a global descriptor; zero stays zero."""
-    peak = max(float(np.abs(row).max()), 1e-30)
-    numbers = np.rint(row / np.float32(peak) * 127).astype(np.int8)
-    norm = float(np.linalg.norm(numbers.astype(np.float32)))
-    return np.float32(1 / max(norm, 1.0)), numbers
-
-
-def encode_block(scales: Array32, rows: NDArray[np.int8]) -> bytes:
-    """Write retrieval rows (n, G) and their scales (n,)."""
-    return scales.astype("<f4").tobytes() + rows.tobytes()
-
-
-def decode_block(payload: memoryview, dim: int) -> tuple[Array32, NDArray[np.int8]]:
-    """View retrieval rows (n, G) and their scales (n,) where they lie."""
-    split = len(payload) // (4 + dim) * 4
-    scales = np.frombuffer(payload[:split], "<f4")
-    return scales, np.frombuffer(payload[split:], np.int8).reshape(-1, dim)

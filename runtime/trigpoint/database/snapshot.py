@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import stat
 from collections.abc import Iterator
@@ -20,10 +21,12 @@ from trigpoint.frame import ModelIdentity
 
 MAX_MAP_BYTES = 2**37  # of address space, not of disk; arm64 kernels may offer no more than 2**39
 OVERWRITTEN = "overwritten while open (replace maps by renaming, not in place)"
+_COPY_BYTES = 2**20
 LOCK_BYTES = 16_384  # more than the lock file of LMDB's 126 readers needs
 
-# LMDB wants one environment for a file in a process: readers and a writer share it.
-_environments: WeakValueDictionary[tuple[int, Path, int, int], lmdb.Environment]
+# LMDB wants one environment for a file in a process: readers and a writer share it. The keys are
+# process, path, file, and the inode of the lock file, 0 without one.
+_environments: WeakValueDictionary[tuple[int, Path, tuple[int, int], int], lmdb.Environment]
 _environments = WeakValueDictionary()
 
 
@@ -31,14 +34,63 @@ def share_environment(path: Path, fd: int) -> lmdb.Environment:
     """Return this process's environment of an open file; it closes with its last user."""
     path = path.resolve()  # LMDB names the lock file after the path: one name for all links
     status = os.fstat(fd)
-    key = (os.getpid(), path, status.st_dev, status.st_ino)
-    environment = _environments.get(key)
-    if environment is None:
-        if any(other[:2] == key[:2] for other in _environments):
-            # The lock file is that of the file which was here before; this one needs its own.
-            path.with_name(path.name + "-lock").unlink(missing_ok=True)
-        environment = _environments[key] = _open_environment(path)
+    file = status.st_dev, status.st_ino
+    with _folder_held(path.parent):  # against other threads too
+        of_path = {
+            (key[2], key[3]): environment
+            for key, environment in _environments.items()
+            if key[:2] == (os.getpid(), path)
+        }
+        for (open_file, _), environment in of_path.items():
+            if open_file == file:
+                return environment
+        require_in_place(path, fd)
+        if _lock_inode(path) in {lock for _, lock in of_path}:
+            lock_path(path).unlink()  # of the file that was here before; this one needs its own
+        environment = _open_environment(path)
+        _environments[os.getpid(), path, file, _lock_inode(path)] = environment
     return environment
+
+
+def put_in_place(new: Path, path: Path) -> None:
+    """Rename a map onto another one, which readers may have open, but no writer other than we."""
+    path = path.resolve()
+    with reporting(path), _folder_held(path.parent):
+        new.rename(path)
+        # It counts the readers of the old file, who keep both; the new one needs its own.
+        lock_path(path).unlink(missing_ok=True)
+
+
+def require_in_place(path: Path, fd: int) -> None:
+    """Raise DatabaseError where a path is no longer that of an open file."""
+    if not os.path.samestat(os.fstat(fd), path.stat()):
+        raise DatabaseError("was replaced while it was being opened; try again")
+
+
+def lock_path(path: Path) -> Path:
+    """Name LMDB's lock file of a map."""
+    return path.with_name(path.name + "-lock")
+
+
+def _lock_inode(path: Path) -> int:
+    try:
+        return lock_path(path).stat().st_ino
+    except FileNotFoundError:
+        return 0
+
+
+@contextmanager
+def _folder_held(folder: Path) -> Iterator[None]:
+    """Keep others from opening or replacing maps in a folder: map and lock file belong together.
+
+    Not by a lock on either file: closing one would drop LMDB's own locks.
+    """
+    fd = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)
 
 
 def _open_environment(path: Path) -> lmdb.Environment:
@@ -67,7 +119,7 @@ def _open_environment(path: Path) -> lmdb.Environment:
 
 def _reserve_lock(path: Path) -> None:
     """Give the lock file its space: LMDB writes it through a mapping, fatally on a full disk."""
-    fd = os.open(path.with_name(path.name + "-lock"), os.O_RDWR | os.O_CREAT, 0o644)
+    fd = os.open(lock_path(path), os.O_RDWR | os.O_CREAT, 0o644)
     try:
         os.posix_fallocate(fd, 0, LOCK_BYTES)
     finally:
@@ -123,7 +175,7 @@ class Snapshot:
             # The file holds a later commit: one is in progress, or another map was copied over it.
             self.is_behind = self._newest_commit() > self._txn.id()
             self._is_kept = self._environment.info()["num_readers"] > 0
-            self._tree = Tree(self._fd, meta)
+            self._meta, self._tree = meta, Tree(self._fd, meta)
             self._checked: set[bytes] = set()
             self._tree.check(schema.METADATA_KEY)
             if self._txn.get(schema.METADATA_KEY) is None:
@@ -178,6 +230,21 @@ class Snapshot:
     def count_entries(self) -> int:
         """Count keys, ours and foreign ones."""
         return self._txn.stat()["entries"]
+
+    def copy_to(self, fd: int) -> None:
+        """Write this state to an empty file, each page in its place.
+
+        So two states differ in the pages that changes have touched, which LMDB's own copies do not
+        promise of one state beside a writer.
+        """
+        meta = self._meta
+        os.pwrite(fd, meta.encode_pages(), 0)
+        offset, end = 2 * meta.page_bytes, meta.num_pages * meta.page_bytes
+        while offset < end:
+            data = os.pread(self._fd, min(_COPY_BYTES, end - offset), offset)
+            if not data:
+                raise DamageError("cut short while open (replace maps by renaming, not in place)")
+            offset += os.pwrite(fd, data, offset)
 
     def require_kept(self) -> None:
         """Raise DatabaseError if a writer may have reused pages of this snapshot.

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trigpoint.geometry.center_averaging import center_directions
+from trigpoint.geometry.rotation_averaging import average_pairs, quaternion_angles
 from trigpoint.rigid import Rigid3, quaternion_from_rotation, rotation_from_quaternion
 
 Array = NDArray[np.float64]
@@ -101,20 +102,20 @@ def find_consensus(
     q = quaternion_from_rotation(query_from_anchors.R @ anchors_from_world.R)
 
     pairs = np.stack(np.triu_indices(len(centers), k=1), axis=1)
-    pairs = pairs[_rotation_angles(q, q)[tuple(pairs.T)] <= max_rotation_error_rad]
+    pairs = pairs[quaternion_angles(q, q)[tuple(pairs.T)] <= max_rotation_error_rad]
     if len(pairs) == 0:
         return NoConsensus.DISAGREEMENT
     pairs = pairs[_rays_cross(centers[pairs], directions[pairs], min_angle_rad)]
     if len(pairs) == 0:
         return NoConsensus.DEGENERATE
     midpoints, ranges = _meet(centers[pairs], directions[pairs])
-    q_pairs = _mean_of_two(q[pairs])
+    q_pairs = average_pairs(q[pairs])
 
     towards = midpoints[:, None] - centers
     distances = np.linalg.norm(towards, axis=2)
     cosines = np.einsum("pki,ki->pk", towards, directions) / np.where(distances > 0, distances, 1)
     direction_errors = np.arccos(np.clip(cosines, -1, 1)) / max_direction_error_rad
-    rotation_errors = _rotation_angles(q_pairs, q) / max_rotation_error_rad
+    rotation_errors = quaternion_angles(q_pairs, q) / max_rotation_error_rad
     votes = (direction_errors <= 1) & (rotation_errors <= 1)
     # A pair among its own voters is in front of both and keeps the inliers from being colinear.
     supported = np.take_along_axis(votes, pairs, axis=1).all(axis=1)
@@ -156,20 +157,3 @@ def _meet(centers: Array, directions: Array) -> tuple[Array, Array]:
     lambdas /= squared_sine[:, None]
     midpoints: Array = (centers + lambdas[:, :, None] * directions).mean(axis=1)
     return midpoints, lambdas
-
-
-def _mean_of_two(q: Array) -> Array:
-    """Mean rotations, as quaternions (P, 4), of pairs (P, 2, 4).
-
-    For two, the eigenvector of `average_rotations` is the normalised sum under equal signs.
-    """
-    sign = np.copysign(1.0, np.sum(q[:, 0] * q[:, 1], axis=1, keepdims=True))
-    total = q[:, 0] + sign * q[:, 1]
-    mean: Array = total / np.linalg.norm(total, axis=1, keepdims=True)
-    return mean
-
-
-def _rotation_angles(q1: Array, q2: Array) -> Array:
-    """Angles (P, K) in radians between rotations given as quaternions (P, 4) and (K, 4)."""
-    angles: Array = 2 * np.arccos(np.minimum(np.abs(q1 @ q2.T), 1))
-    return angles

@@ -37,6 +37,23 @@ def average_rotations(R: Array, weights: Array | None = None) -> Array:
     return rotation_from_quaternion(eigenvectors[:, -1])
 
 
+def average_pairs(q: Array) -> Array:
+    """Mean rotations, as quaternions (P, 4), of pairs (P, 2, 4).
+
+    For two, the eigenvector of `average_rotations` is the normalised sum under equal signs.
+    """
+    sign = np.copysign(1.0, np.sum(q[:, 0] * q[:, 1], axis=1, keepdims=True))
+    total = q[:, 0] + sign * q[:, 1]
+    mean: Array = total / np.linalg.norm(total, axis=1, keepdims=True)
+    return mean
+
+
+def quaternion_angles(q1: Array, q2: Array) -> Array:
+    """Angles (P, K) in radians between rotations given as unit quaternions (P, 4) and (K, 4)."""
+    angles: Array = 2 * np.arccos(np.minimum(np.abs(q1 @ q2.T), 1))
+    return angles
+
+
 def average_rotations_govindu(anchors_from_world: Rigid3, query_from_anchors: Rigid3) -> Array:
     """Return the least squares solution of Q_kq q_q = q_k (paper, eq. 6; Govindu, 2001).
 

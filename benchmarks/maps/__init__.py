@@ -1,0 +1,1 @@
+"""Measure maps: their profiles, and retrieval in large ones."""

@@ -1,0 +1,1 @@
+"""The commands of `trigpoint-db`, those that belong together in one module."""

@@ -1,0 +1,65 @@
+"""Figures, with matplotlib, an extra."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from trigpoint.errors import ConfigError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PICTURES = (".png", ".svg", ".pdf")
+
+
+def make_figure(
+    width_in: float,
+    height_in: float,
+    *,
+    layout: Literal["constrained", "compressed"] = "constrained",
+) -> Figure:
+    """Make an empty figure."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ConfigError(
+            "drawing needs matplotlib; install it with: pip install 'trigpoint[plots]'"
+        ) from error
+    figure = Figure((width_in, height_in), dpi=150, layout=layout)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def check_picture(path: Path) -> None:
+    """Refuse a picture of a kind that cannot be drawn."""
+    if path.suffix.lower() not in PICTURES:
+        raise ConfigError(f"cannot draw {path}; name it {' or '.join(PICTURES)}")
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as the kind of picture that the file's name ends in."""
+    check_picture(path)
+    try:
+        figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+
+
+def to_svg(figure: Figure) -> str:
+    """Return a figure as an SVG element for a page: what is black takes the text's color there."""
+    import matplotlib as mpl
+
+    file = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "trigpoint"}):
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    svg = file.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r'<g id="[^"]*">', "<g>", svg)  # the same in every figure of a page
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    # Texts without a color are black, too.
+    svg = svg.replace("<svg ", '<svg fill="currentColor" ', 1)
+    return re.sub(r"#000000|\bblack\b", "currentColor", svg)

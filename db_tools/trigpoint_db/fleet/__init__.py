@@ -1,0 +1,1 @@
+"""A map published to a fleet, and fetched from there."""

@@ -1,0 +1,55 @@
+"""What the commands share: arguments of the same meaning, progress bars, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterable, Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from trigpoint.database.codec import Profile
+from trigpoint.errors import ConfigError
+from trigpoint.frame import Session
+
+T = TypeVar("T")
+console = Console()
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")]
+Model = Annotated[str, typer.Option(help="The network: tiny, base, large, or a file (.onnx).")]
+Retrieval = Annotated[
+    Path | None, typer.Option(help="A retrieval network, where the other needs one beside it.")
+]
+MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="A .tpmap file.")]
+MapProfile = Annotated[
+    Profile | None,
+    typer.Option("--profile", help="standard, or compact: a third of the size, less precise."),
+]
+SessionName = Annotated[
+    str | None, typer.Option("--session", help="What survey the images are of, a name.")
+]
+SessionDate = Annotated[
+    datetime | None, typer.Option("--date", formats=["%Y-%m-%d"], help="Of the survey.")
+]
+
+
+def track(items: Iterable[T], what: str, total: int) -> Generator[T, None, None]:
+    """Show a progress bar on standard error, which keeps standard output clean."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
+        yield from progress.track(items, total=total, description=what)
+
+
+def track_calibration(images: list[int]) -> Iterator[int]:
+    """Show a progress bar of a calibration."""
+    return track(images, "calibrating", len(images))
+
+
+def make_session(name: str | None, day: datetime | None) -> Session | None:
+    """Make what --session and --date name."""
+    if name is None and day is not None:
+        raise ConfigError("--date is that of a session; give its name with --session")
+    return None if name is None else Session(name, day and day.date())

@@ -1,0 +1,328 @@
+"""Maps published and fetched over real Zenoh sessions on loopback."""
+
+import contextlib
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.unit.conftest import Run
+from tests.unit.flaky_publisher import NUM_CHUNKS
+from tests.unit.maps import MODEL, add, make_features, require_image
+from trigpoint.database.reader import MapReader
+from trigpoint.database.writer import MapWriter
+from trigpoint.errors import ConfigError, SourceError
+from trigpoint_db.fleet.fetch import fetch_map
+from trigpoint_db.fleet.manifest import CHUNK_BYTES, Manifest
+from trigpoint_db.fleet.zenoh import Publisher, RemoteMap, check_key, open_session
+
+KEY = "trigpoint/maps/office"
+NUM_IMAGES = 500
+TIMEOUT_S = 60
+
+
+@pytest.fixture(scope="module")
+def office_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A map of a dozen chunks."""
+    path = tmp_path_factory.mktemp("office") / "office.tpmap"
+    with MapWriter.create(path, MODEL) as writer:
+        for index in range(NUM_IMAGES):
+            add(writer, index, features=make_features(index, num_keypoints=1000))
+    return path.read_bytes()
+
+
+@pytest.fixture
+def office(office_bytes: bytes, tmp_path: Path) -> Path:
+    (tmp_path / "ground").mkdir()
+    path = tmp_path / "ground" / "office.tpmap"
+    path.write_bytes(office_bytes)
+    return path
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    (tmp_path / "drone").mkdir()
+    return tmp_path / "drone" / "office.tpmap"
+
+
+@pytest.fixture
+def endpoint(port: int) -> str:
+    return f"tcp/127.0.0.1:{port}"
+
+
+def extend(path: Path, index: int = NUM_IMAGES) -> None:
+    with MapWriter.open(path, MODEL) as writer:
+        add(writer, index)
+
+
+def generation_of(path: Path) -> int:
+    with MapReader.open(path) as reader:
+        assert reader.verify() == []
+        return reader.generation
+
+
+def wait_until(is_true: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + TIMEOUT_S
+    while not is_true():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def untracked(chunks: Iterable[int], what: str, total: int) -> Iterable[int]:
+    return chunks
+
+
+@contextlib.contextmanager
+def publishing(path: Path, endpoint: str) -> Iterator[Publisher]:
+    with Publisher(open_session(None, None, [endpoint]), KEY, path) as publisher:
+        yield publisher
+
+
+@contextlib.contextmanager
+def process(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """Run a module; it is gone at the end."""
+    started = subprocess.Popen(
+        [sys.executable, "-m", *map(str, arguments)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2],
+    )  # fmt: skip
+    try:
+        yield started
+    finally:
+        started.kill()
+        started.communicate()
+
+
+@contextlib.contextmanager
+def flaky(office: Path, endpoint: str, fault: str) -> Iterator[subprocess.Popen[str]]:
+    with process("tests.unit.flaky_publisher", office, KEY, endpoint, fault) as publisher:
+        assert publisher.stdout is not None
+        assert publisher.stdout.readline() == "ready\n"
+        yield publisher
+
+
+def fetching(out: Path, endpoint: str, *more: object) -> list[object]:
+    return ["fetch", KEY, "-o", out, "--connect", endpoint, *more]
+
+
+def num_fetched(out: Path) -> int:
+    """Count the chunks that are in the file beside a map."""
+    partial = out.with_name(out.name + ".fetch")
+    data = partial.read_bytes() if partial.exists() else b""
+    return sum(any(data[i : i + CHUNK_BYTES]) for i in range(0, len(data), CHUNK_BYTES))
+
+
+def test_a_map_arrives_and_a_commit_costs_what_it_has_changed(
+    office: Path, out: Path, endpoint: str, run: Run
+) -> None:
+    with publishing(office, endpoint) as publisher:
+        code, text, _ = run(*fetching(out, endpoint, "--json"))
+        assert code == 0
+        assert json.loads(text)["num_bytes_fetched"] == office.stat().st_size
+        with MapReader.open(out) as reader:  # as a daemon has it
+            extend(office)
+            assert publisher.refresh()
+            code, text, _ = run(*fetching(out, endpoint, "--json"))
+            assert code == 0
+            assert 0 < json.loads(text)["num_bytes_fetched"] <= 4 * CHUNK_BYTES
+            assert len(reader) == NUM_IMAGES
+            assert reader.refresh()
+            assert reader.verify() == []
+            require_image(reader, NUM_IMAGES)
+        code, text, _ = run(*fetching(out, endpoint))
+        assert code == 0
+        assert "up to date" in text
+    assert {path.name for path in out.parent.iterdir()} <= {out.name, out.name + "-lock"}
+    assert {path.name for path in office.parent.iterdir()} <= {office.name, office.name + "-lock"}
+
+
+def test_a_publisher_killed_in_the_middle_and_started_again(
+    office: Path, out: Path, endpoint: str
+) -> None:
+    with process("trigpoint_db.cli", *fetching(out, endpoint, "--json")) as fetch:
+        with flaky(office, endpoint, "dies") as publisher:
+            assert publisher.wait(TIMEOUT_S) == -9
+        assert fetch.poll() is None
+        with process("trigpoint_db.cli", "publish", office, "--key", KEY, "--listen", endpoint):
+            text, err = fetch.communicate(timeout=TIMEOUT_S)
+    assert fetch.returncode == 0, err
+    assert json.loads(text)["num_images"] == NUM_IMAGES
+    assert generation_of(out) == generation_of(office)
+
+
+def test_a_fetch_killed_in_the_middle_goes_on(
+    office: Path, out: Path, endpoint: str, run: Run
+) -> None:
+    with (
+        flaky(office, endpoint, "stalls"),
+        process("trigpoint_db.cli", *fetching(out, endpoint)) as fetch,
+    ):
+        wait_until(lambda: num_fetched(out) >= NUM_CHUNKS)
+        code, _, err = run(*fetching(out, endpoint))  # another one at the same time
+        assert code == 1
+        assert "another writer has it open" in err
+        fetch.kill()
+        fetch.wait(TIMEOUT_S)
+    assert not out.exists()
+    extend(office)  # the manifest is another one, most of its chunks are the same
+    with publishing(office, endpoint):
+        code, text, _ = run(*fetching(out, endpoint, "--json"))
+    assert code == 0
+    assert json.loads(text)["num_bytes_fetched"] < office.stat().st_size - CHUNK_BYTES
+    assert generation_of(out) == generation_of(office)
+
+
+def test_a_chunk_that_is_not_what_the_manifest_says_is_not_taken(
+    office: Path, out: Path, endpoint: str, run: Run
+) -> None:
+    out.write_bytes(b"the old one")
+    with flaky(office, endpoint, "lies"):
+        code, _, err = run(*fetching(out, endpoint))
+    assert code == 1
+    assert f"chunk 1 of {KEY} does not have the hash of its manifest" in err
+    assert "\n" not in err
+    assert out.read_bytes() == b"the old one"
+
+
+def test_a_map_that_changes_while_it_is_fetched(office: Path, out: Path, endpoint: str) -> None:
+    with publishing(office, endpoint) as publisher:
+        change = threading.Lock()
+
+        class Watched(RemoteMap):
+            def get_chunk(self, sha256: str) -> list[bytes | None]:
+                with change:
+                    if publisher.manifest.num_images == NUM_IMAGES:
+                        extend(office)
+                        assert publisher.refresh()
+                return super().get_chunk(sha256)
+
+        session = open_session(None, [endpoint], None)
+        remote = Watched(session, KEY)
+        fetched = fetch_map(remote, out, patience_s=TIMEOUT_S, track=untracked)
+        session.close()  # type: ignore[no-untyped-call]
+    assert fetched.manifest.num_images == NUM_IMAGES + 1
+    assert generation_of(out) == generation_of(office)
+
+
+def test_two_fetch_while_a_writer_writes(office: Path, out: Path, endpoint: str) -> None:
+    is_over = threading.Event()
+
+    def write() -> None:
+        index = NUM_IMAGES
+        while not is_over.is_set():
+            extend(office, index)
+            index += 1
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        with publishing(office, endpoint) as publisher:
+            other = out.with_name("other.tpmap")
+            with (
+                process("trigpoint_db.cli", *fetching(out, endpoint)) as first,
+                process("trigpoint_db.cli", *fetching(other, endpoint)) as second,
+            ):
+                assert [p.wait(TIMEOUT_S) for p in (first, second)] == [0, 0]
+            published = publisher.manifest
+    finally:
+        is_over.set()
+        writer.join()
+    for path in (out, other):
+        assert generation_of(path) == published.generation
+    assert generation_of(office) > published.generation
+    assert out.read_bytes() == other.read_bytes()
+
+
+def test_watch_follows_the_generations(office: Path, out: Path, endpoint: str) -> None:
+    with (
+        publishing(office, endpoint) as publisher,
+        process("trigpoint_db.cli", *fetching(out, endpoint, "--watch")) as fetch,
+    ):
+        for index in range(NUM_IMAGES, NUM_IMAGES + 2):
+            wait_until(lambda: out.exists() and generation_of(out) == generation_of(office))
+            extend(office, index)
+            assert publisher.refresh()
+        wait_until(lambda: generation_of(out) == generation_of(office))
+        assert fetch.poll() is None
+
+
+def test_watch_outlives_what_goes_wrong(office: Path, out: Path, endpoint: str) -> None:
+    MapWriter.create(out, MODEL).close()
+    with (
+        publishing(office, endpoint) as publisher,
+        process("trigpoint_db.cli", *fetching(out, endpoint, "--watch")) as fetch,
+    ):
+        with MapWriter.open(out, MODEL):  # a map that is written to is not replaced
+            assert fetch.stderr is not None
+            said = next(line for line in fetch.stderr if "another writer" in line)
+        assert said.endswith("; trying again\n")
+        extend(office)
+        assert publisher.refresh()
+        wait_until(lambda: generation_of(out) == generation_of(office))
+
+
+def test_a_full_disk_keeps_the_old_map(office: Path, tmp_path: Path, endpoint: str) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    fetch = f"exec {sys.executable} -m trigpoint_db.cli fetch {KEY} -o {disk}/m.tpmap"
+    script = (
+        f"mount -t tmpfs -o size=4m none {disk} || exit 77; echo old > {disk}/m.tpmap; "
+        f"({fetch} --connect {endpoint}); code=$?; cat {disk}/m.tpmap; ls -A {disk}; exit $code"
+    )
+    with publishing(office, endpoint):
+        done = subprocess.run(
+            ["unshare", "-rm", "sh", "-c", script],
+            capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+        )  # fmt: skip
+    if done.returncode == 77 or "unshare" in done.stderr:
+        pytest.skip(f"a disk cannot be mounted here: {done.stderr.strip()}")
+    assert done.returncode == 1
+    assert done.stdout == "old\nm.tpmap\n"
+    assert "MB are free; make room there" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_nobody_publishes(out: Path, endpoint: str, run: Run) -> None:
+    code, _, err = run(*fetching(out, endpoint, "--timeout", 0))
+    assert code == 1
+    assert f"nothing came on {KEY} for 0 s" in err
+    assert list(out.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("key", ["", "/a", "a//b", "maps/*", "maps/**", "a?b", "a#b"])
+def test_keys_that_cannot_be_used(key: str) -> None:
+    with pytest.raises(ConfigError, match="key"):
+        check_key(key)
+
+
+@pytest.mark.parametrize("listen", ["nonsense", "tcp/256.0.0.1:1"])
+def test_endpoints_that_cannot_be_used(listen: str, office: Path, run: Run) -> None:
+    code, _, err = run("publish", office, "--key", KEY, "--listen", listen)
+    assert code == 1
+    assert "write an endpoint as" in err
+    assert "\n" not in err
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"num_bytes": 0}, "num_bytes"),
+        ({"num_bytes": 2**50}, "num_bytes"),
+        ({"chunks": []}, "0 chunks"),
+        ({"sha256": "f" * 63}, "sha256"),
+        ({"chunk_bytes": 1}, "chunk_bytes"),
+    ],
+)
+def test_manifests_that_cannot_be_used(change: dict[str, object], said: str) -> None:
+    good = Manifest(
+        num_bytes=5, sha256="0" * 64, chunk_bytes=4096, chunks=["0" * 64], generation=1,
+        num_images=1, model="m", model_sha256="0" * 64,
+    )  # fmt: skip
+    with pytest.raises(SourceError, match=said) as caught:
+        Manifest.decode(json.dumps(good.model_dump() | change).encode())
+    assert "\n" not in str(caught.value)
+    assert Manifest.decode(good.model_dump_json().encode()) == good
