@@ -61,6 +61,23 @@ def test_a_reader_keeps_its_snapshot_while_another_process_writes(tmp_path: Path
             require_image(reader, expected - 1)
 
 
+def test_a_writer_that_is_closed_keeps_nobody_out_though_a_child_has_its_file(
+    tmp_path: Path,
+) -> None:
+    path = make_map(tmp_path / "m.tpmap", 1)
+    with MapWriter.open(path, MODEL):
+        held = [Path("/proc/self/fd", fd.name) for fd in Path("/proc/self/fd").iterdir()]
+        held = [fd for fd in held if fd.exists() and fd.samefile(path)]
+        # As a process has them that was forked meanwhile, until it is another program.
+        inherited = [os.dup(int(fd.name)) for fd in held]
+    try:
+        assert inherited
+        MapWriter.open(path, MODEL).close()
+    finally:
+        for fd in inherited:
+            os.close(fd)
+
+
 def test_a_second_writer_is_turned_away(tmp_path: Path) -> None:
     path = make_map(tmp_path / "a.tpmap", 1)
     with other_process("add-on-demand", path) as writer:

@@ -22,7 +22,7 @@ from typing import Protocol, Self
 
 from trigpoint.database.replacing import install_map
 from trigpoint.database.snapshot import reporting, require_in_place
-from trigpoint.database.writer import keep_writers_out
+from trigpoint.database.writer import keep_writers_out, let_writers_in
 from trigpoint.errors import ConfigError, SourceError
 from trigpoint_db.fleet.manifest import Manifest, hash_file
 
@@ -172,7 +172,7 @@ class _Partial:
         self._path = partial_fetch(self._target)
         with reporting(self._path), ExitStack() as undo:
             self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
-            undo.callback(os.close, self._fd)
+            undo.callback(let_writers_in, self._fd)
             keep_writers_out(self._fd)
             require_in_place(self._path, self._fd)
             is_new = os.fstat(self._fd).st_size == 0

@@ -13,7 +13,7 @@ from trigpoint.database.codec import Profile
 from trigpoint.database.index import MIN_ROWS, build_index
 from trigpoint.database.reader import MapReader
 from trigpoint.database.snapshot import lock_path, put_in_place, reporting
-from trigpoint.database.writer import MapWriter, keep_writers_out
+from trigpoint.database.writer import MapWriter, keep_writers_out, let_writers_in
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import ModelIdentity
 
@@ -163,7 +163,7 @@ def install_map(new: Path, path: Path) -> None:
     with reporting(path), ExitStack() as stack:
         if path.exists():
             old = os.open(path, os.O_RDONLY)
-            stack.callback(os.close, old)
+            stack.callback(let_writers_in, old)
             keep_writers_out(old)
         _sync(new)
         put_in_place(new, path)

@@ -85,7 +85,7 @@ class MapWriter:
                 raise DatabaseError("cannot be made: its folder does not exist") from None
             undo.callback(path.unlink)
             undo.callback(lock_path(path).unlink, missing_ok=True)
-            undo.callback(os.close, fd)
+            undo.callback(let_writers_in, fd)
             keep_writers_out(fd)
             metadata = schema.Metadata(model, generation, profile=profile)
             environment = _writable_environment(path, fd)
@@ -100,7 +100,7 @@ class MapWriter:
         """Open a map to add images whose features come from the same model."""
         with reporting(path), ExitStack() as undo:
             fd = os.open(path, os.O_RDWR)
-            undo.callback(os.close, fd)
+            undo.callback(let_writers_in, fd)
             keep_writers_out(fd)
             require_in_place(path, fd)
             Snapshot(path, model).close()  # before LMDB writes to the lock file
@@ -293,7 +293,7 @@ class MapWriter:
         if self._txn is not None:
             self._txn.abort()
         self._txn = self._environment = None
-        os.close(self._fd)
+        let_writers_in(self._fd)
 
     def __enter__(self) -> Self:
         return self
@@ -371,11 +371,17 @@ def _writable_environment(path: Path, fd: int) -> lmdb.Environment:
 
 
 def keep_writers_out(fd: int) -> None:
-    """Be the only writer of an open map file until it is closed; another one is an error."""
+    """Be the only writer of an open map file until `let_writers_in`; another one is an error."""
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise DatabaseError("another writer has it open; wait until it has finished") from None
+
+
+def let_writers_in(fd: int) -> None:
+    """Close a map file, and let others write, also while a process that was forked has it open."""
+    fcntl.flock(fd, fcntl.LOCK_UN)
+    os.close(fd)
 
 
 def _require_sound(path: Path) -> None:
