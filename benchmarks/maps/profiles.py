@@ -13,7 +13,6 @@ import numpy as np
 
 from benchmarks.localizer.comparison import errors
 from benchmarks.localizer.tables import quantile
-from benchmarks.models.scores import markdown
 from trigpoint.database.codec import Profile
 from trigpoint.database.reader import MapReader
 from trigpoint.database.replacing import compact_map
@@ -22,6 +21,7 @@ from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint_db.build import build_map, read_frame, select_images
 from trigpoint_db.calibrate import calibrate_map
+from trigpoint_db.experiments.tables import markdown
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.poses import read_names, read_queries
 
