@@ -171,7 +171,7 @@ endif
 # Settings that are there already stay.
 install-units:
 	install -d '$(LIB)/systemd/system'
-	for unit in trigpointd trigpointd@; do \
+	for unit in trigpointd trigpointd@ trigpoint-fetch@; do \
 	  sed 's|/usr/local|$(PREFIX)|' systemd/$$unit.service >'$(LIB)/systemd/system/'$$unit.service; done
 	install -Dm644 systemd/70-trigpoint.rules '$(LIB)/udev/rules.d/70-trigpoint.rules'
 	install -Dm644 systemd/trigpoint.sysusers '$(LIB)/sysusers.d/trigpoint.conf'
@@ -183,6 +183,7 @@ uninstall:
 	rm -rf '$(LIB)/trigpoint'
 	rm -f '$(DESTDIR)$(PREFIX)/bin/trigpointd' '$(DESTDIR)$(PREFIX)/bin/trigpoint-db' \
 	  '$(LIB)/systemd/system/trigpointd.service' '$(LIB)/systemd/system/trigpointd@.service' \
+	  '$(LIB)/systemd/system/trigpoint-fetch@.service' \
 	  '$(LIB)/udev/rules.d/70-trigpoint.rules' '$(LIB)/sysusers.d/trigpoint.conf' \
 	  '$(LIB)/tmpfiles.d/trigpoint.conf'
 
