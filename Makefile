@@ -18,6 +18,7 @@ SETTINGS = $(DESTDIR)/etc/trigpoint/trigpoint.toml
 
 .PHONY: demo test kill-test test-oak test-systemd test-v4l2 check golden
 .PHONY: bench bench-building bench-models bench-localizer bench-daemon bench-maps walkthrough soak wheel-test clean
+.PHONY: experiments
 .PHONY: install install-program install-units uninstall
 
 # uv where it is installed, else venv and pip.
@@ -114,6 +115,26 @@ soak: $(READY) $(DEMO)/map.tpmap
 $(DEMO)/map.tpmap: | $(READY)
 	$(BIN)/trigpoint-db demo $(DEMO)
 
+# The paper's experiments, as far as they need no public data set, and docs/experiments.md; about
+# 12 minutes. What is interrupted goes on. INT8 is compared with FP32 where that network is, times with
+# hloc's where its checkout is named (it needs h5py, tqdm and packaging):
+# make experiments HLOC=../Hierarchical-Localization
+EXPERIMENTS := build/experiments
+FLOAT = $(or $(FP32),$(wildcard build/fp32))
+experiments: $(READY)
+	$(BIN)/trigpoint-db experiment noise --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment averaging --data $(DATA) --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment anchors --data $(DATA) --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment ablation --data $(DATA) --output $(EXPERIMENTS) \
+	  $(if $(FLOAT),--fp32 '$(FLOAT)') >/dev/null
+	$(BIN)/trigpoint-db experiment methods --data $(DATA) --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment timing --data $(DATA) --output $(EXPERIMENTS) \
+	  $(if $(HLOC),--hloc '$(HLOC)') >/dev/null
+	$(BIN)/trigpoint-db experiment redkitchen --data $(DATA) --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment recall --data $(DATA) --output $(EXPERIMENTS) >/dev/null
+	$(BIN)/trigpoint-db experiment page $(EXPERIMENTS) docs
+	rm -rf $(EXPERIMENTS)/maps $(EXPERIMENTS)/room # the next run measures anew
+
 # Profiles of maps, and retrieval in maps of up to a million images; half an hour and 2 GB.
 bench-maps: $(READY)
 	@mkdir -p build/bench
@@ -150,7 +171,7 @@ endif
 # Settings that are there already stay.
 install-units:
 	install -d '$(LIB)/systemd/system'
-	for unit in trigpointd trigpointd@; do \
+	for unit in trigpointd trigpointd@ trigpoint-fetch@; do \
 	  sed 's|/usr/local|$(PREFIX)|' systemd/$$unit.service >'$(LIB)/systemd/system/'$$unit.service; done
 	install -Dm644 systemd/70-trigpoint.rules '$(LIB)/udev/rules.d/70-trigpoint.rules'
 	install -Dm644 systemd/trigpoint.sysusers '$(LIB)/sysusers.d/trigpoint.conf'
@@ -162,6 +183,7 @@ uninstall:
 	rm -rf '$(LIB)/trigpoint'
 	rm -f '$(DESTDIR)$(PREFIX)/bin/trigpointd' '$(DESTDIR)$(PREFIX)/bin/trigpoint-db' \
 	  '$(LIB)/systemd/system/trigpointd.service' '$(LIB)/systemd/system/trigpointd@.service' \
+	  '$(LIB)/systemd/system/trigpoint-fetch@.service' \
 	  '$(LIB)/udev/rules.d/70-trigpoint.rules' '$(LIB)/sysusers.d/trigpoint.conf' \
 	  '$(LIB)/tmpfiles.d/trigpoint.conf'
 

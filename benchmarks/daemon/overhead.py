@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.daemon.daemon import Setup, check_alive, running, subscriber
-from benchmarks.models.scores import markdown
 from benchmarks.stage_times import describe_machine
 from trigpoint.errors import TrigpointError
 from trigpoint.output import check_output, open_text
+from trigpoint_db.experiments.tables import markdown
 from trigpointd.messages.cdr import decode_pose
 
 WARM_UP = 30  # frames

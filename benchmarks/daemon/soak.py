@@ -27,10 +27,10 @@ import zenoh
 
 from benchmarks.daemon.daemon import BASE_KEY, Process, Setup, check_alive, running, subscriber
 from benchmarks.daemon.growth import Slope, fifth, fit_slope, has_risen
-from benchmarks.models.scores import markdown
 from benchmarks.stage_times import describe_machine
 from trigpoint.errors import TrigpointError
 from trigpoint_db.demo import BODY_FROM_CAMERA, CAMERA
+from trigpoint_db.experiments.tables import markdown
 from trigpoint_db.poses import read_poses
 
 SAMPLE_S, REQUEST_S, UNPLUG_S, MAP_S, RELOAD_S = 1.0, 10.0, 30.0, 45.0, 10.0

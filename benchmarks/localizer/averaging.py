@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.models.scores import markdown
 from trigpoint.frame import Reason
 from trigpoint.geometry.center_averaging import (
     average_centers,
@@ -28,6 +27,7 @@ from trigpoint.geometry.translation_averaging import (
 from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3, rotate, rotation_from_vector
 from trigpoint.stages import average_poses
+from trigpoint_db.experiments.tables import markdown
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.poses import read_names, read_queries
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,23 +13,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.localizer.hloc import Hloc, write_keypoints, write_matches
 from trigpoint.database.reader import MapReader
 from trigpoint.frame import Anchor, Frame, Localized, Result, Statistics
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
-from trigpoint.models.matching import Matchable, MutualNearestNeighbors
+from trigpoint.models.matching import Matchable
 from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import build_map, read_frame, select_images
 from trigpoint_db.calibrate import calibrate_map
+from trigpoint_db.experiments.hloc import (
+    Hloc,
+    match_map,
+    match_query,
+    write_keypoints,
+    write_matches,
+)
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.poses import read_names, read_queries
 
 Array = NDArray[np.float64]
 
 HLOC = "hloc"
-NUM_NEIGHBOURS = 20  # of each anchor, those with the most matches: hloc's map is made of these
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,30 +165,3 @@ def errors(estimate: Rigid3 | None, truth: Rigid3) -> tuple[float, float]:
         return np.inf, np.inf
     distance = np.linalg.norm(estimate.center - truth.center)
     return float(distance), float(np.rad2deg(rotation_angle((estimate @ truth.inverse()).R)))
-
-
-def match_map(anchors: dict[str, Anchor]) -> dict[tuple[str, str], NDArray[np.intp]]:
-    """Match all anchors, and keep each one's matches with its best neighbours."""
-    names = list(anchors)
-    matcher = MutualNearestNeighbors()
-    matchable = {name: Matchable.of(anchor, anchor.camera) for name, anchor in anchors.items()}
-    matches = {
-        (a, b): matcher.match(matchable[a], matchable[b])[0]
-        for a, b in itertools.combinations(names, 2)
-    }
-    kept = set()
-    for name in names:
-        own = [pair for pair in matches if name in pair]
-        kept.update(sorted(own, key=lambda pair: -len(matches[pair]))[:NUM_NEIGHBOURS])
-    return {pair: matches[pair] for pair in matches if pair in kept}
-
-
-def match_query(
-    query: Matchable, anchors: dict[str, Anchor], retrieved: Sequence[str]
-) -> dict[str, NDArray[np.intp]]:
-    """Match a query with the anchors retrieved for it."""
-    matcher = MutualNearestNeighbors()
-    return {
-        name: matcher.match(query, Matchable.of(anchors[name], anchors[name].camera))[0]
-        for name in retrieved
-    }

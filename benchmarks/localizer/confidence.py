@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from benchmarks.localizer.trials import NOT_OF_THIS_WORLD, Trial
-from benchmarks.models.scores import markdown
+from trigpoint_db.experiments.tables import markdown
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import threadpoolctl
 
-from benchmarks.models.scores import markdown
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
 from trigpoint.frame import Frame, LocalFeatures, Localized
@@ -21,6 +20,7 @@ from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.rigid import Rigid3
 from trigpoint_db.demo import CAMERA
+from trigpoint_db.experiments.tables import markdown
 from trigpoint_db.synthetic import flight_poses, make_room, render, survey_poses
 
 NUM_SURVEY, NUM_FLIGHT, NUM_KEYPOINTS = 60, 20, 1024

@@ -12,7 +12,7 @@ from scipy.stats import beta, chi2
 
 from benchmarks.localizer.comparison import HLOC, Case
 from benchmarks.localizer.trials import NOT_OF_THIS_WORLD, Trial
-from benchmarks.models.scores import markdown
+from trigpoint_db.experiments.tables import markdown
 
 Array = NDArray[np.float64]
 Cases = Mapping[str, Sequence[Case]]  # by set and split

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from benchmarks.localizer.__main__ import find_sets, say
 from benchmarks.maps import profiles, retrieval, rows
-from benchmarks.models.scores import markdown
 from benchmarks.stage_times import describe_machine
 from trigpoint.errors import TrigpointError
 from trigpoint.models.features import FeatureModel
 from trigpoint.output import check_output, open_text
 from trigpoint_db.build import read_frame
+from trigpoint_db.experiments.tables import markdown
 from trigpoint_db.importers.colmap import read_model
 
 MIN_IMAGES = 40  # of a set that places are made of

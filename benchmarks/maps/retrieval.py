@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from benchmarks.localizer.__main__ import say
 from benchmarks.maps.rows import Places
-from benchmarks.models.scores import markdown
 from trigpoint.camera import Camera
 from trigpoint.database.index import build_index
 from trigpoint.database.reader import MapReader
@@ -23,6 +22,7 @@ from trigpoint.database.writer import MapWriter
 from trigpoint.frame import LocalFeatures, ModelIdentity
 from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
+from trigpoint_db.experiments.tables import markdown
 
 Array32 = NDArray[np.float32]
 

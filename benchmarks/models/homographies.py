@@ -12,10 +12,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from benchmarks.models.methods import NUM_KEYPOINTS, Features
-from benchmarks.models.scores import area, markdown
+from benchmarks.models.scores import area
 from benchmarks.models.surveys import LONG_SIDE_PX, shrink
 from training.scenes import MIN_SIDE_PX, photograph_paths
 from trigpoint.images import read_gray
+from trigpoint_db.experiments.tables import markdown
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.models.poses import SETS
-from benchmarks.models.scores import markdown
 from benchmarks.models.surveys import Survey
 from trigpoint.database.reader import MapReader
 from trigpoint.frame import Localized
@@ -17,6 +16,7 @@ from trigpoint.models.features import FeatureModel
 from trigpoint_db.build import build_map, select_images
 from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.evaluate import evaluate
+from trigpoint_db.experiments.tables import markdown
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.localize import Outcome, localize_images
 from trigpoint_db.poses import Query, read_names, read_queries

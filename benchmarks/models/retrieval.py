@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.models.methods import NUM_KEYPOINTS, Features
-from benchmarks.models.scores import markdown
 from benchmarks.models.surveys import Survey, shrink
 from benchmarks.models.vlad import Vlad
 from trigpoint.database.ranking import POOL, choose_diverse, find_largest
 from trigpoint.images import read_gray
 from trigpoint.options import LocalizerOptions
+from trigpoint_db.experiments.tables import markdown
 from trigpoint_db.poses import read_names
 
 RANKS = (1, 5, 10, 20)

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from benchmarks.models.methods import NUM_KEYPOINTS, Features
 from benchmarks.models.poses import Matches, Pairs, pose_errors
-from benchmarks.models.scores import area, markdown
+from benchmarks.models.scores import area
 from benchmarks.models.surveys import LONG_SIDE_PX, Survey, shrink
 from trigpoint.frame import LocalFeatures
+from trigpoint_db.experiments.tables import markdown
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]

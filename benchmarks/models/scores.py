@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -41,9 +39,3 @@ def _resample(num_cases: int) -> Array:
     """Weights (NUM_RESAMPLES, N) of the cases in samples drawn with replacement."""
     rng = np.random.default_rng(0)
     return rng.multinomial(num_cases, np.full(num_cases, 1 / num_cases), NUM_RESAMPLES) / num_cases
-
-
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], num_words: int = 1) -> str:
-    """Lay out a table; all but the first `num_words` columns are numbers."""
-    rule = ["---"] * num_words + ["---:"] * (len(header) - num_words)
-    return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *rows))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.models.edgepoint2 import open_session
 from benchmarks.models.methods import BASELINE, NUM_KEYPOINTS, Method
-from benchmarks.models.scores import markdown
+from trigpoint_db.experiments.tables import markdown
 
 SIZE = (640, 480)
 WARM_UP = 3

@@ -12,12 +12,14 @@ from trigpoint.errors import TrigpointError
 from trigpoint_db.commands import (
     build,
     datasets,
+    experiments,
     fleet,
     maps,
     networks,
     recordings,
     report,
     results,
+    scenes,
     survey,
 )
 
@@ -29,6 +31,8 @@ app = typer.Typer(
 )
 for commands in (build, results, maps, survey, report, datasets, recordings, networks, fleet):
     app.add_typer(commands.app)  # on the same level
+experiments.app.add_typer(scenes.app)
+app.add_typer(experiments.app, name="experiment")
 
 
 @app.callback()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from trigpoint.errors import ConfigError
 
 if TYPE_CHECKING:
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 PICTURES = (".png", ".svg", ".pdf")
@@ -47,6 +48,16 @@ def save_figure(figure: Figure, path: Path) -> None:
         figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+
+
+def label_plainly(axis: Axis) -> None:
+    """Label a logarithmic axis 0.1, 0.2, 0.5, 1 ... (0.1, 1 ... a long one), not by powers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1,) if high > 100 * low > 0 else (1, 2, 5)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def to_svg(figure: Figure) -> str:

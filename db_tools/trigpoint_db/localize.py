@@ -6,11 +6,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from trigpoint.errors import ConfigError, DatabaseError, SourceError
-from trigpoint.frame import Failed, Prior, Result
+from trigpoint.frame import Failed, Localized, Prior, Result, describe, summarize
 from trigpoint.localizer import Localizer
+from trigpoint.rigid import Rigid3
 from trigpoint_db.build import read_frame
+from trigpoint_db.methods.baseline import Baseline, Estimate
 from trigpoint_db.poses import Query
 
 
@@ -19,11 +22,28 @@ class Outcome:
     """What came of a query."""
 
     name: str
-    result: Result | Failed
+    result: Result | Estimate | Failed
+
+    @property
+    def cam_from_world(self) -> Rigid3 | None:
+        """The pose, where there is one."""
+        if isinstance(self.result, Localized | Estimate):
+            return self.result.cam_from_world
+        return None
+
+    def summarize(self) -> str:
+        """Say in a word what came of it: LOCALIZED, or the reason why not."""
+        return "LOCALIZED" if isinstance(self.result, Estimate) else summarize(self.result)
+
+    def describe(self) -> dict[str, Any]:
+        """Say in JSON's types what came of it."""
+        if isinstance(self.result, Estimate):
+            return {"name": self.name, **self.result.describe()}
+        return {"name": self.name, **describe(self.result)}
 
 
 def localize_images(
-    localizer: Localizer,
+    localizer: Localizer | Baseline,
     queries: Iterable[Query],
     folder: Path,
     priors: Mapping[str, Prior] = MappingProxyType({}),
@@ -35,7 +55,7 @@ def localize_images(
     for query in queries:
         try:
             frame = read_frame(folder, query.name, query.camera)
-            result: Result | Failed = localizer.localize(frame, priors.get(query.name))
+            result: Result | Estimate | Failed = localizer.localize(frame, priors.get(query.name))
         except (ConfigError, SourceError) as error:
             result = Failed("BAD_FRAME", str(error))
         except DatabaseError as error:

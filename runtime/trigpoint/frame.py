@@ -306,8 +306,7 @@ def describe(result: Result | Failed) -> dict[str, Any]:
     """Say in JSON's types what came of a frame."""
     if isinstance(result, Failed):
         return {"status": "FAILED", "reason": result.reason, "detail": result.detail}
-    stage_ms = {k: round(v, 3) for k, v in result.statistics.stage_ms.items()}
-    statistics = {**vars(result.statistics), "stage_ms": stage_ms}
+    statistics = describe_statistics(result.statistics)
     if isinstance(result, Lost):
         return {"status": "LOST", "reason": result.reason, "detail": result.detail, **statistics}
     return {
@@ -318,3 +317,9 @@ def describe(result: Result | Failed) -> dict[str, Any]:
         "covariance": result.covariance.tolist(),
         **statistics,
     }
+
+
+def describe_statistics(statistics: Statistics) -> dict[str, Any]:
+    """Say it in JSON's types, times to the microsecond."""
+    stage_ms = {stage: round(ms, 3) for stage, ms in statistics.stage_ms.items()}
+    return {**vars(statistics), "stage_ms": stage_ms}

@@ -151,6 +151,12 @@ class Localizer:
         """Solve for the pose with the anchors that a query is matched with, all at once."""
         return self._solve(query, True, _Trace(self.clock, Statistics()))
 
+    def refine(
+        self, query: Query, cam_from_world: Rigid3
+    ) -> tuple[LatentPoints, RefinedPose | None]:
+        """Refine a hypothesis; a subclass may do so in another way, to compare."""
+        return refine(query, cam_from_world, self.options)
+
     def _localize(
         self, frame: Frame, prior: Prior | None, statistics: Statistics, deadline: _Deadline
     ) -> Result:
@@ -293,7 +299,7 @@ class Localizer:
 
         with trace.stage("refinement"):
             _, generator, hypothesis = max(hypotheses, key=lambda hypothesis: hypothesis[0])
-            latent, refined = refine(query, hypothesis, options)
+            latent, refined = self.refine(query, hypothesis)
         trace.note(generator=generator, num_points=len(latent.point))
         if refined is None:
             detail = "the latent points do not determine a pose"

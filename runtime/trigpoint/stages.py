@@ -17,7 +17,7 @@ from trigpoint.camera import Camera
 from trigpoint.errors import ModelError
 from trigpoint.frame import Anchor, LocalFeatures, PoseNoise, Reason, Support
 from trigpoint.geometry.absolute_pose import estimate_absolute_pose
-from trigpoint.geometry.anchor_ransac import NoConsensus, find_consensus
+from trigpoint.geometry.anchor_ransac import AnchorConsensus, NoConsensus, find_consensus
 from trigpoint.geometry.center_averaging import (
     average_centers,
     average_centers_robust,
@@ -60,7 +60,7 @@ class Query:
     tracks : Tracks
         All matches: point is the query's keypoint, view the anchor, xy the place in the anchor.
     matches : list of (M, 2) int
-        By anchor: query's keypoint, row in `anchor_points`; best first.
+        By anchor: query's keypoint, anchor's keypoint; best first.
     anchor_points : list of (M, 2) float64
         By anchor: where its matched keypoints are, in the order of `matches`.
     num_matcher_failures : int
@@ -133,9 +133,9 @@ def match_anchors(
             num_failures += 1
         xy = anchor.camera.normalize(anchor.keypoints[pairs[:, 1]])
         usable = seen[pairs[:, 0]] & np.isfinite(xy).all(axis=1)
-        matches.append(pairs[usable, 0])
+        matches.append(pairs[usable])
         anchor_points.append(xy[usable])
-    point = np.concatenate(matches)
+    point = np.concatenate(matches)[:, 0]
     view = np.repeat(np.arange(len(anchors)), [len(match) for match in matches])
     order = np.argsort(point, kind="stable")
     views_px = np.array([pixel_size(anchor.camera, long_side_px) for anchor in anchors])
@@ -180,7 +180,7 @@ def estimate_relative_poses(query: Query, options: LocalizerOptions) -> tuple[In
     for k in by_matches[: options.num_relative_poses]:
         pose = estimate_relative_pose(
             query.anchor_points[k],
-            query.points[query.matches[k]],
+            query.points[query.matches[k][:, 0]],
             max_error=options.max_epipolar_error_px * float(mean_px(query, k)),
         )
         if pose is not None and pose.inliers.sum() >= options.min_relative_inliers:
@@ -189,15 +189,10 @@ def estimate_relative_poses(query: Query, options: LocalizerOptions) -> tuple[In
     return np.array(chosen, dtype=np.intp), Rigid3.stack(poses)
 
 
-def average_poses(
+def agree_on_pose(
     anchors_from_world: Rigid3, query_from_anchors: Rigid3, options: LocalizerOptions
-) -> tuple[Rigid3, int] | Reason:
-    """Stage 1 of the paper: RANSAC over anchor pairs, center averaging, rotation averaging.
-
-    Returns the query's cam_from_world and how many anchors agree on it, or why there is none.
-    """
-    if len(anchors_from_world) < 2:
-        return Reason.FEW_ANCHORS
+) -> AnchorConsensus | Reason:
+    """Find the pose that most anchors agree on, by RANSAC over pairs of them."""
     consensus = find_consensus(
         anchors_from_world,
         query_from_anchors,
@@ -207,12 +202,30 @@ def average_poses(
     )
     if consensus is NoConsensus.DEGENERATE:
         return Reason.DEGENERATE_ANCHORS
-    if isinstance(consensus, NoConsensus):
-        return Reason.FEW_ANCHORS
-    anchors, relative = (
-        anchors_from_world[consensus.inliers],
-        query_from_anchors[consensus.inliers],
-    )
+    return Reason.FEW_ANCHORS if isinstance(consensus, NoConsensus) else consensus
+
+
+def find_consistent(
+    anchors_from_world: Rigid3, query_from_anchors: Rigid3, options: LocalizerOptions
+) -> tuple[Rigid3, Rigid3] | Reason:
+    """Keep the anchors, and their relative poses, that agree on one pose."""
+    consensus = agree_on_pose(anchors_from_world, query_from_anchors, options)
+    if isinstance(consensus, Reason):
+        return consensus
+    return anchors_from_world[consensus.inliers], query_from_anchors[consensus.inliers]
+
+
+def average_poses(
+    anchors_from_world: Rigid3, query_from_anchors: Rigid3, options: LocalizerOptions
+) -> tuple[Rigid3, int] | Reason:
+    """Stage 1 of the paper: RANSAC over anchor pairs, center averaging, rotation averaging.
+
+    Returns the query's cam_from_world and how many anchors agree on it, or why there is none.
+    """
+    consistent = find_consistent(anchors_from_world, query_from_anchors, options)
+    if isinstance(consistent, Reason):
+        return consistent
+    anchors, relative = consistent
     average = average_centers_robust if options.center == "robust" else average_centers
     center = average(anchors.center, center_directions(anchors, relative))
     if center is None:

@@ -136,3 +136,24 @@ ExecStart=/usr/bin/python3 -c "{program}" {device}
     assert "PermissionError: [Errno 1] Operation not permitted: '/dev/ttyS0'" in journal(
         "trigpointd@camera"
     )
+
+
+def test_a_map_of_the_fleet_is_kept_up_to_date() -> None:
+    unit, fetched = "trigpoint-fetch@fleet", STATE / "fleet.tpmap"
+    (SETTINGS / "fleet.json5").write_text("""{
+        connect: { endpoints: ["tcp/127.0.0.1:7449"] },
+        scouting: { multicast: { enabled: false } },
+    }""")
+    assert run("systemctl", "start", unit).returncode == 0, journal(unit)
+    program = "/usr/local/lib/trigpoint/bin/trigpoint-db"
+    publish = [program, "publish", str(STATE / "hang.tpmap"), "--key", "trigpoint/maps/fleet"]
+    publisher = subprocess.Popen([*publish, "--listen", "tcp/127.0.0.1:7449"])
+    try:
+        wait_until(fetched.exists, unit)
+        wait_until_said(unit, "fleet.tpmap: generation")
+    finally:
+        publisher.kill()
+        publisher.wait()
+    assert fetched.owner() == "trigpoint"
+    assert run("systemctl", "stop", unit).returncode == 0
+    assert show(unit, "Result") == "success"

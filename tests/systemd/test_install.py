@@ -12,6 +12,7 @@ pytestmark = [
     pytest.mark.skipif(shutil.which("make") is None, reason="needs make"),
 ]
 INSTALLED = {
+    "lib/systemd/system/trigpoint-fetch@.service",
     "lib/systemd/system/trigpointd.service",
     "lib/systemd/system/trigpointd@.service",
     "lib/sysusers.d/trigpoint.conf",
@@ -41,6 +42,8 @@ def test_everything_is_where_systemd_looks(tmp_path: Path, prefix: str) -> None:
     for name in ("trigpointd", "trigpointd@"):
         unit = tmp_path / prefix / f"lib/systemd/system/{name}.service"
         assert f"\nExecStart=/{prefix}/lib/trigpoint/bin/trigpointd run " in unit.read_text()
+    unit = tmp_path / prefix / "lib/systemd/system/trigpoint-fetch@.service"
+    assert f"\nExecStart=/{prefix}/lib/trigpoint/bin/trigpoint-db fetch " in unit.read_text()
 
 
 def test_settings_survive_another_install_and_the_uninstall(tmp_path: Path) -> None:

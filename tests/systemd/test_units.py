@@ -14,13 +14,18 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(params=["trigpointd.service", "trigpointd@.service"])
+DAEMON = ["trigpointd.service", "trigpointd@.service"]
+FETCH = "trigpoint-fetch@.service"
+
+
+@pytest.fixture(params=[*DAEMON, FETCH])
 def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A unit as it is installed, but with a program that is there."""
     name: str = request.param
     text = (SYSTEMD / name).read_text()
     installed = tmp_path / name
-    installed.write_text(text.replace("/usr/local/lib/trigpoint/bin/trigpointd", sys.executable))
+    program = "trigpoint-db" if name == FETCH else "trigpointd"
+    installed.write_text(text.replace(f"/usr/local/lib/trigpoint/bin/{program}", sys.executable))
     return installed
 
 
@@ -33,13 +38,13 @@ def run(*command: object) -> subprocess.CompletedProcess[str]:
 def test_systemd_takes_the_unit_as_it_is(unit: Path) -> None:
     done = run("systemd-analyze", "verify", "--man=no", unit)
     assert done.returncode == 0, done.stderr
-    assert "trigpointd" not in done.stderr
+    assert "trigpoint" not in done.stderr
 
 
 def test_a_mistake_in_the_unit_would_be_found(unit: Path) -> None:
-    unit.write_text(unit.read_text().replace("WatchdogSec", "WatchdogSeconds"))
+    unit.write_text(unit.read_text().replace("TimeoutStopSec", "TimeoutStopSeconds"))
     done = run("systemd-analyze", "verify", "--man=no", unit)
-    assert "WatchdogSeconds" in done.stderr
+    assert "TimeoutStopSeconds" in done.stderr
 
 
 def test_its_exposure_is_at_most_2(unit: Path) -> None:
@@ -48,6 +53,7 @@ def test_its_exposure_is_at_most_2(unit: Path) -> None:
     assert "Overall exposure level" in done.stdout
 
 
+@pytest.mark.parametrize("unit", DAEMON, indirect=True)
 def test_cameras_stay_in_reach(unit: Path) -> None:
     lines = unit.read_text().splitlines()
     assert not [line for line in lines if line.startswith("PrivateDevices")]  # it hides /dev/video0

@@ -70,7 +70,10 @@ def test_the_commands_on_maps_and_data_sets_are_such() -> None:
     lines = re.findall(r"trigpoint-db (\w[\w-]*)(.*?)[`\n]", text)
     assert {"build", "queries", "submit"} <= {name for name, _ in lines}
     for name, arguments in lines:
-        known = {option for parameter in group.commands[name].params for option in parameter.opts}
+        command = group.commands[name]
+        if isinstance(command, typer.core.TyperGroup):
+            command = command.commands[arguments.split()[0]]
+        known = {option for parameter in command.params for option in parameter.opts}
         named = set(
             re.findall(r"(?<![\w-])--?[a-z][\w-]*", re.sub(r"'.*?'|\".*?\"", "", arguments))
         )

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -22,6 +23,7 @@ from trigpoint_db.fleet.manifest import CHUNK_BYTES, Manifest
 from trigpoint_db.fleet.zenoh import Publisher, RemoteMap, check_key, open_session
 
 KEY = "trigpoint/maps/office"
+UNIT = Path(__file__).parents[2] / "systemd" / "trigpoint-fetch@.service"
 NUM_IMAGES = 500
 TIMEOUT_S = 60
 
@@ -263,6 +265,22 @@ def test_watch_outlives_what_goes_wrong(office: Path, out: Path, endpoint: str) 
         extend(office)
         assert publisher.refresh()
         wait_until(lambda: generation_of(out) == generation_of(office))
+
+
+@pytest.mark.skipif(not UNIT.is_file(), reason="needs the checkout's systemd/")
+def test_the_unit_fetches_what_it_is_named_for(office: Path, tmp_path: Path, endpoint: str) -> None:
+    """Its ExecStart, without systemd: what %i and the variables stand for is filled in."""
+    settings = {"connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
+    (tmp_path / "fleet.json5").write_text(json.dumps(settings))
+    unit = UNIT.read_text()
+    (command,) = re.findall(r"^ExecStart=\S+/trigpoint-db (.*)$", unit, re.MULTILINE)
+    command = re.sub(r"\$\{\w+\}", str(tmp_path), command.replace("%i", "office"))
+    with publishing(office, endpoint), process("trigpoint_db.cli", *command.split()) as fetch:
+        assert fetch.stdout is not None
+        assert "office.tpmap: generation" in fetch.stdout.readline()
+        fetch.terminate()
+        assert f"SuccessExitStatus={fetch.wait(TIMEOUT_S)}" in unit.splitlines()
+    assert generation_of(tmp_path / "office.tpmap") == generation_of(office)
 
 
 def test_a_full_disk_keeps_the_old_map(office: Path, tmp_path: Path, endpoint: str) -> None:

@@ -13,7 +13,7 @@ import typer
 
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError, SourceError
-from trigpoint.frame import Failed, Localized, describe, summarize
+from trigpoint.frame import Failed
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.matching import load_matcher
@@ -25,6 +25,8 @@ from trigpoint_db.build import (
 from trigpoint_db.evaluate import evaluate, plot_paths, read_truth
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import localize_images
+from trigpoint_db.methods.baseline import Baseline
+from trigpoint_db.methods.registry import MethodName
 from trigpoint_db.poses import (
     read_names,
     read_poses,
@@ -60,6 +62,9 @@ def localize(
     matcher: Annotated[
         Path | None, typer.Option(help="A matching network; mutual nearest neighbours by default.")
     ] = None,
+    method: Annotated[
+        MethodName, typer.Option(help="The localizer, latent-points, or one to compare it with.")
+    ] = MethodName.LATENT_POINTS,
     as_json: Json = False,
 ) -> None:
     """Localize images; OK poses go to a file, what came of every query to another."""
@@ -78,17 +83,19 @@ def localize(
     with MapReader.open(map_, network.identity) as reader, ExitStack() as stack:
         if len(reader) == 0:
             raise ConfigError(f"{map_} holds no images; add some: trigpoint-db build --append")
-        lines = None if results is None else stack.enter_context(open_text(results))
         localizer = Localizer(network, reader, options, time.perf_counter, matching)
-        localized = localize_images(localizer, wanted, images, around)
+        is_own = method == MethodName.LATENT_POINTS
+        solver = localizer if is_own else Baseline(method, localizer)
+        lines = None if results is None else stack.enter_context(open_text(results))
+        localized = localize_images(solver, wanted, images, around)
         outcomes = []
         for outcome in track(localized, "localizing", len(wanted)):
             outcomes.append(outcome)
             if lines is not None:
-                lines.write(json.dumps({"name": outcome.name, **describe(outcome.result)}) + "\n")
-    found = {o.name: o.result.cam_from_world for o in outcomes if isinstance(o.result, Localized)}
+                lines.write(json.dumps(outcome.describe()) + "\n")
+    found = {o.name: o.cam_from_world for o in outcomes if o.cam_from_world is not None}
     write_poses(poses, found)
-    counts = Counter(summarize(outcome.result) for outcome in outcomes)
+    counts = Counter(outcome.summarize() for outcome in outcomes)
     others = ", ".join(f"{n} {reason}" for reason, n in counts.items() if reason != "LOCALIZED")
     if as_json:
         print(json.dumps({"num_queries": len(outcomes), "outcomes": counts}))

@@ -71,6 +71,11 @@ class MapReader:
                 snapshot.require_kept()
 
     @property
+    def path(self) -> Path:
+        """The map's file."""
+        return self._path
+
+    @property
     def model(self) -> ModelIdentity:
         """Which network made the features."""
         return self._metadata.model

@@ -8,6 +8,7 @@ h5py.
 from __future__ import annotations
 
 import importlib
+import itertools
 import logging
 import os
 import sys
@@ -21,12 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trigpoint.errors import ConfigError
-from trigpoint.frame import Anchor
+from trigpoint.frame import Anchor, LocalFeatures
+from trigpoint.models.matching import Matchable, MutualNearestNeighbors
 from trigpoint.rigid import Rigid3
 from trigpoint_db.importers.base import PosedImage
 from trigpoint_db.importers.colmap import write_model
 
 MAX_ERROR_PX = 12.0  # the default of hloc's localize_sfm
+NUM_NEIGHBOURS = 20  # of each anchor, those with the most matches: the map is made of these
 
 Matches = Mapping[tuple[str, str], NDArray[np.intp]]
 
@@ -63,6 +66,11 @@ class Hloc:
         config = {"estimation": {"ransac": {"max_error": MAX_ERROR_PX}}}
         self._localizer = self._localize_sfm.QueryLocalizer(reconstruction, config)
         self.num_points = len(reconstruction.points3D)
+
+    @property
+    def num_model_bytes(self) -> int:
+        """How large the reconstruction is as COLMAP keeps it."""
+        return sum(path.stat().st_size for path in (self._scratch / "sfm").glob("*.bin"))
 
     def localize(
         self, name: str, camera: Any, anchors: Iterable[str], features: Path, matches: Path
@@ -106,11 +114,54 @@ def write_matches(path: Path, matches: Matches) -> None:
             group.create_dataset("matching_scores0", data=(matched >= 0).astype(np.float16))
 
 
+def write_features(path: Path, features: Mapping[str, LocalFeatures]) -> None:
+    """Write local and global features as hloc keeps them, in half precision."""
+    import h5py
+
+    with h5py.File(path, "w", libver="latest") as file:
+        for name, image in features.items():
+            group = file.create_group(name)
+            for key, values in (
+                ("keypoints", image.keypoints),
+                ("descriptors", image.descriptors.T),
+                ("scores", image.scores),
+                ("global_descriptor", image.global_descriptor),
+            ):
+                group.create_dataset(key, data=values.astype(np.float16))
+
+
+def match_map(anchors: Mapping[str, Anchor]) -> dict[tuple[str, str], NDArray[np.intp]]:
+    """Match all anchors, and keep each one's matches with its best neighbours."""
+    names = list(anchors)
+    matcher = MutualNearestNeighbors()
+    matchable = {name: Matchable.of(anchor, anchor.camera) for name, anchor in anchors.items()}
+    matches = {
+        (a, b): matcher.match(matchable[a], matchable[b])[0]
+        for a, b in itertools.combinations(names, 2)
+    }
+    kept = set()
+    for name in names:
+        own = [pair for pair in matches if name in pair]
+        kept.update(sorted(own, key=lambda pair: -len(matches[pair]))[:NUM_NEIGHBOURS])
+    return {pair: matches[pair] for pair in matches if pair in kept}
+
+
+def match_query(
+    query: Matchable, anchors: Mapping[str, Anchor], retrieved: Sequence[str]
+) -> dict[str, NDArray[np.intp]]:
+    """Match a query with the anchors retrieved for it."""
+    matcher = MutualNearestNeighbors()
+    return {
+        name: matcher.match(query, Matchable.of(anchors[name], anchors[name].camera))[0]
+        for name in retrieved
+    }
+
+
 def _import(checkout: Path) -> tuple[Any, Any, Any]:
     os.environ["TQDM_DISABLE"] = "1"  # before hloc imports it
     sys.path.insert(0, str(checkout))
     try:
-        triangulation = importlib.import_module("hloc.triangulation")
+        triangulation: Any = importlib.import_module("hloc.triangulation")
         localize_sfm = importlib.import_module("hloc.localize_sfm")
         pycolmap = importlib.import_module("pycolmap")
     except ImportError as error:

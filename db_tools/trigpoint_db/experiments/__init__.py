@@ -1,0 +1,1 @@
+"""The paper's experiments: each measures, and writes its table and its picture from the result."""
