@@ -16,6 +16,7 @@ from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError
 from trigpoint.frame import Frame, LocalFeatures, Session
 from trigpoint.models.features import FeatureModel
+from trigpoint.rigid import Rigid3
 from trigpoint_db.extraction import Crew, EncodedImage, extract_by_workers, extract_features
 from trigpoint_db.importers.base import PosedImage
 
@@ -100,14 +101,23 @@ def _pass_over(images: Iterator[PosedImage], path: Path, session: Session | None
             image = next(images, None)
             if (
                 image is None
-                or (image.name, image.camera, session) != (name, camera, sessions[index])
-                or not np.allclose(image.cam_from_world.R, pose.R, rtol=0, atol=1e-9)
-                or not np.allclose(image.cam_from_world.t, pose.t, rtol=1e-9, atol=0)
+                or (image.name, session) != (name, sessions[index])
+                or not is_taken_so(image, camera, pose)
             ):
                 raise ConfigError(
                     f"{path} was begun with other images, poses or sessions: its image {index} is "
                     f"{name!r}; give those again, or remove it to begin anew"
                 )
+
+
+def is_taken_so(image: PosedImage, camera: Camera, cam_from_world: Rigid3) -> bool:
+    """Say whether a camera and a pose are those of an image, but for what a map rounds."""
+    R, t = image.cam_from_world.R, image.cam_from_world.t
+    return (
+        image.camera == camera
+        and np.allclose(R, cam_from_world.R, rtol=0, atol=1e-9)
+        and np.allclose(t, cam_from_world.t, rtol=1e-9, atol=0)
+    )
 
 
 def append_map(

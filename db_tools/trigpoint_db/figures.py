@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from trigpoint.errors import ConfigError
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
@@ -50,10 +51,17 @@ def save_figure(figure: Figure, path: Path) -> None:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from error
 
 
-def label_plainly(axis: Axis) -> None:
-    """Label a logarithmic axis 0.1, 0.2, 0.5, 1 ... (0.1, 1 ... a long one), not by powers."""
+def scale_logarithmically(axes: Axes, which: Literal["x", "y"] = "x") -> None:
+    """Make an axis that has anything on it logarithmic, labelled 0.1, 0.2, 0.5, 1 ...
+
+    A long one is labelled 0.1, 1, 10 ...
+    """
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
+    axis: Axis = axes.xaxis if which == "x" else axes.yaxis
+    if not axis.get_data_interval()[1] > 0:
+        return
+    axes.set(**{f"{which}scale": "log"})
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1,) if high > 100 * low > 0 else (1, 2, 5)))
     axis.set_major_formatter(StrMethodFormatter("{x:g}"))

@@ -52,6 +52,38 @@ def test_without_results_it_says_how_to_get_one(tmp_path: Path) -> None:
         write_page(tmp_path, tmp_path / "docs")
 
 
+def snapshot(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("text", ["{", '{"machine": {}}', '{"machine": 1, "rows": 2}'])
+def test_a_damaged_result_is_named_and_leaves_the_docs_as_they_are(
+    tmp_path: Path, text: str
+) -> None:
+    docs, first, second = tmp_path / "docs", tmp_path / "first", tmp_path / "second"
+    Store(first).write("averaging", averaging_result(0.0303))
+    Store(first).write("noise", noise.measure(20, Store(first)))
+    write_page(first, docs)
+    before = snapshot(docs)
+    Store(second).write("noise", noise.measure(21, Store(second)))
+    (second / "averaging.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"second/averaging\.json is not .* measure it anew"):
+        write_page(second, docs)
+    assert snapshot(docs) == before
+
+
+def test_results_that_the_docs_have_already_can_be_named(tmp_path: Path) -> None:
+    Store(tmp_path / "experiments").write("averaging", averaging_result(0.0303))
+    assert "0.0303" in write_page(tmp_path / "experiments", tmp_path).read_text()
+
+
+def test_a_folder_of_results_that_is_missing_is_named(tmp_path: Path, run: Run) -> None:
+    Store(tmp_path / "experiments").write("averaging", averaging_result(0.03))
+    code, _, error = run("experiment", "page", tmp_path / "typo", tmp_path)
+    assert code == 1
+    assert f"there is no folder {tmp_path / 'typo'}" in " ".join(error.split())
+
+
 def test_the_command_names_the_page(tmp_path: Path, run: Run) -> None:
     Store(tmp_path).write("averaging", averaging_result(0.03))
     code, out, _ = run("experiment", "page", tmp_path, tmp_path / "docs")
@@ -62,5 +94,6 @@ def test_the_command_names_the_page(tmp_path: Path, run: Run) -> None:
 def test_no_number_on_the_page_was_typed(tmp_path: Path) -> None:
     """It is what its results make of it."""
     shutil.copytree(DOCS / "experiments", tmp_path / "experiments")
+    (tmp_path / "nothing new").mkdir()
     page = write_page(tmp_path / "nothing new", tmp_path)
     assert page.read_text() == (DOCS / "experiments.md").read_text()

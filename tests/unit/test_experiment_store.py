@@ -44,6 +44,27 @@ def test_a_line_cut_off_counts_as_not_done(tmp_path: Path) -> None:
     assert run_until(tmp_path, {"seed": 0}, "c") == ["b", "c"]
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [b"[]", b"12", b'"text"', b'{"key": "c"}', b'{"key": [], "value": 1}',
+     b'{"key": "c", "value": "\xff"}', b"\xff\xfe"],
+)  # fmt: skip
+def test_from_a_damaged_line_on_nothing_counts_as_done(tmp_path: Path, damage: bytes) -> None:
+    run_until(tmp_path, {"seed": 0}, "b")
+    path = tmp_path / "squares.jsonl"
+    settings, first, second = path.read_bytes().splitlines()
+    path.write_bytes(b"\n".join([settings, first, damage, second, b""]))
+    assert run_until(tmp_path, {"seed": 0}, "c") == ["b", "c"]
+
+
+@pytest.mark.parametrize("settings", [b"\xff", b"[]", b"12", b""])
+def test_with_damaged_settings_it_begins_anew(tmp_path: Path, settings: bytes) -> None:
+    run_until(tmp_path, {"seed": 0}, "b")
+    path = tmp_path / "squares.jsonl"
+    path.write_bytes(settings + path.read_bytes()[len(b'{"seed": 0}') :])
+    assert run_until(tmp_path, {"seed": 0}, "c") == KEYS
+
+
 def test_a_result_is_read_as_it_was_written_and_a_new_run_begins_after_it(tmp_path: Path) -> None:
     run_until(tmp_path, {"seed": 0}, "c")
     path = Store(tmp_path).write("squares", {"rows": [1 / 3, 2, None], "name": "x"})

@@ -28,12 +28,15 @@ from trigpoint_db.experiments import ablation, anchors, averaging, noise
 from trigpoint_db.experiments.sets import (
     choose,
     find_sets,
+    fingerprint,
+    identify,
     open_map,
     read_scenes,
     read_splits,
     read_wholes,
 )
 from trigpoint_db.experiments.store import read_result
+from trigpoint_db.experiments.tables import median
 from trigpoint_db.importers.base import Dataset
 
 NUM_IMAGES = 12
@@ -103,7 +106,7 @@ def test_more_anchors_step_by_step(data: Path, output: Path, run: Run) -> None:
     rows = result["rows"]
     assert [row["num_anchors"] for row in rows] == [2, 3, 5, 10, NUM_IMAGES - 1]
     for before, after in itertools.pairwise(rows):
-        assert after["ms"][anchors.RELATIVE_POSES] >= before["ms"][anchors.RELATIVE_POSES]
+        assert after["ms"][anchors.RELATIVE_POSES] > before["ms"][anchors.RELATIVE_POSES]
     assert max(rows[-1]["medians"].values()) < 0.05
     assert out.strip() == anchors.write_table(result)
     check_picture(output / "anchors.png")
@@ -235,3 +238,37 @@ def test_there_must_be_something_to_measure_on(tmp_path: Path, run: Run) -> None
         1,
         "trigpoint-db: there is nothing to measure on: give --data or --root",
     )
+
+
+def test_a_percentile_is_that_of_the_ranks_beside_it() -> None:
+    """Failures above them change nothing."""
+    assert median([1.0, 2.0, None]) == 2.0
+    assert median([3.0, None, 1.0, None, 2.0]) == 3.0
+    assert median([*map(float, range(1, 11)), None], 90) == 10.0
+    assert median([1.0, None]) is None
+
+
+def test_a_run_of_other_data_or_of_another_network_begins_anew(
+    data: Path, tmp_path: Path, model: FeatureModel
+) -> None:
+    sets = read_splits(data)
+    dataset = sets["corner"]
+    shift = Rigid3.from_center(np.eye(3), np.ones(3))
+    truth = {name: pose @ shift for name, pose in dataset.truth.items()}
+    moved = replace(dataset, truth=truth)
+    focal = dataset.mapped[0].camera
+    lens = replace(focal, params=(focal.params[0] + 1, *focal.params[1:]))
+    other = replace(dataset, mapped=[replace(dataset.mapped[0], camera=lens), *dataset.mapped[1:]])
+    known = {fingerprint(each) for each in (dataset, moved, other)}
+    assert len(known) == 3
+    assert identify(model, sets)["sha256"] == model.identity.sha256
+    with open_map(tmp_path, "corner", dataset, model) as reader:
+        assert reader.anchor(0).camera == focal
+    with open_map(tmp_path, "corner", other, model) as reader:
+        assert reader.anchor(0).camera == lens
+
+
+def test_pictures_of_nothing_are_drawn(tmp_path: Path) -> None:
+    row = {"set": "a", "num_averaged": 0, "medians": dict.fromkeys(noise.METHODS)}
+    averaging.draw({"rows": [row]}, tmp_path / "averaging.png")
+    assert (tmp_path / "averaging.png").is_file()

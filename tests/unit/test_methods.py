@@ -86,7 +86,7 @@ def test_retrieval_gives_the_pose_of_the_first_anchor() -> None:
 
 
 def test_the_midpoint_is_that_of_one_pair_and_averages_are_of_all_that_agree() -> None:
-    """With turned anchors the averages differ from each other and from the best pair's pose."""
+    """With anchors astray; where rotations are right, both averages are the same."""
     scene = make_scene("turned", num_points=200, num_views=8)
     matched = match_scene(scene)
     rng = generator("turns")
@@ -98,7 +98,8 @@ def test_the_midpoint_is_that_of_one_pair_and_averages_are_of_all_that_agree() -
     found = [load_method(name)(matched, options) for name in names]
     assert all(isinstance(pose, Rigid3) for pose in found)
     centers = np.array([pose.center for pose in found if isinstance(pose, Rigid3)])
-    assert np.linalg.norm(centers - centers[[1, 2, 0]], axis=1).min() > 1e-4
+    assert np.linalg.norm(centers[1:] - centers[0], axis=1).min() > 1e-4
+    np.testing.assert_allclose(centers[1], centers[2], atol=1e-5)
     chosen, relative = estimate_relative_poses(matched.query, options)
     expected = average_rotations(relative.R @ noisy[chosen].R)
     assert isinstance(found[1], Rigid3)

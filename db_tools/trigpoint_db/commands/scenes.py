@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from trigpoint.errors import ConfigError
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.retrieval import RetrievalModel
 from trigpoint_db.commands.experiments import DATA, RESULTS, ROOT, Output, open_store, publish
@@ -124,7 +125,13 @@ def recall_command(
 ) -> None:
     """Count the retrieved images that see what the query sees, in a rendered room and elsewhere."""
     splits = {} if data is None else read_splits(data)
-    sets = {name: dataset for name, dataset in splits.items() if name.endswith("block")}
+    sets = {name: dataset for name, dataset in splits.items() if name.endswith(", block")}
+    if data is not None and not sets:
+        raise ConfigError(
+            f"no set in {data} has map_block.txt and queries_block.txt, the names of a split by "
+            "blocks: retrieval is measured on these, as other splits have neighbours of each query "
+            "in the map"
+        )
     sets |= {} if root is None else read_scenes(root)
     external = None if retrieval is None else RetrievalModel.load(retrieval)
     store, network = open_store(output), FeatureModel.load(model)

@@ -23,10 +23,10 @@ from trigpoint.stages import Query
 from trigpoint_db import poses
 from trigpoint_db.build import read_frame
 from trigpoint_db.experiments.averaging import describe_choice
-from trigpoint_db.experiments.sets import choose, open_map
+from trigpoint_db.experiments.sets import choose, identify, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import geometric_mean, markdown, median, number
-from trigpoint_db.figures import label_plainly, make_figure, save_figure
+from trigpoint_db.figures import make_figure, save_figure, scale_logarithmically
 from trigpoint_db.importers.base import Dataset
 
 
@@ -71,7 +71,7 @@ VARIANTS = {
         replace(OPTIONS, generator="anchor_pairs", center="least_squares")
     ),
     "anchors' poses exact": Variant(EXACT),
-    "anchors' poses exact, E1 then E2 unweighted": Variant(OPTIONS, PlainRefinement),
+    "anchors' poses exact, E1 then E2 unweighted": Variant(EXACT, PlainRefinement),
     "all matches, not the guided": Variant(replace(OPTIONS, max_guided_error_px=1e5)),
     "6 anchors, no second round": Variant(replace(OPTIONS, num_anchors=OPTIONS.first_anchors)),
     "20 anchors at once, no adaptive K": Variant(
@@ -81,7 +81,7 @@ VARIANTS = {
     FLOAT: Variant(OPTIONS, is_float=True),
     PAPER: Variant(
         replace(
-            OPTIONS,
+            EXACT,
             first_anchors=OPTIONS.num_anchors,
             num_relative_poses=OPTIONS.num_anchors,
             num_refined_anchors=OPTIONS.num_anchors,
@@ -112,7 +112,8 @@ def measure(
             "variants": {label: str(variant) for label, variant in variants.items()},
             "networks": [each.identity.sha256 for each in networks.values() if each],
             "queries": keys,
-        },
+        }
+        | identify(network, sets),
     )
     for name, dataset in sets.items():
         if all(key in store for key in keys[name]):
@@ -233,7 +234,8 @@ def write_table(result: Mapping[str, Any]) -> str:
             "localizer as it is: geometric means of those of the medians and of the 90th "
             "percentiles of the position errors, where both are finite (lost queries have "
             "infinite errors), and of the median times. What covariance weights bring is the "
-            f"difference between the two rows with exact poses.{absent}" + describe_choice(result),
+            f"difference between the two rows with exact poses; {PAPER!r} keeps the guided "
+            f"matches, INT8 and {OPTIONS.num_anchors} anchors.{absent}" + describe_choice(result),
             markdown(["taken back", "median", "90th percentile", "lost", "time"], overall),
             verdict,
             "The medians:",
@@ -256,8 +258,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
     axes.axvline(1, color="gray", linewidth=0.8)
     axes.set_yticks(range(len(variants)), variants)
     axes.invert_yaxis()
-    axes.set_xscale("log")
-    label_plainly(axes.xaxis)
+    scale_logarithmically(axes)
     axes.set_xlabel("median position error over that of the localizer as it is, each set a dot")
     axes.grid(axis="x", which="both", alpha=0.3)
     save_figure(figure, path)

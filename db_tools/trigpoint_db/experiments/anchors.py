@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from trigpoint.database.reader import MapReader
+from trigpoint.errors import ConfigError
 from trigpoint.frame import Localized, Lost, Reason, Result
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
@@ -23,10 +24,10 @@ from trigpoint.models.matching import MutualNearestNeighbors
 from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
 from trigpoint.stages import Query, average_poses, estimate_relative_poses, match_anchors
-from trigpoint_db.experiments.sets import choose, open_map
+from trigpoint_db.experiments.sets import choose, identify, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import markdown, median, number
-from trigpoint_db.figures import label_plainly, make_figure, save_figure
+from trigpoint_db.figures import make_figure, save_figure, scale_logarithmically
 from trigpoint_db.importers.base import Dataset
 
 T = TypeVar("T")
@@ -49,11 +50,14 @@ def measure(
     sets: Mapping[str, Dataset], network: FeatureModel, max_queries: int, store: Store
 ) -> dict[str, Any]:
     """Sweep over the number of anchors for some images of each set."""
+    for name, dataset in sets.items():
+        if len(dataset.mapped) < 3:
+            raise ConfigError(f"{name} has {len(dataset.mapped)} images; the sweep needs 3")
     chosen = {
         name: choose(range(len(dataset.mapped)), max_queries) for name, dataset in sets.items()
     }
     settings = {"network": network.identity.name, "anchors": list(NUM_ANCHORS)}
-    store.begin("anchors", settings | {"images": chosen})
+    store.begin("anchors", settings | {"images": chosen} | identify(network, sets))
     rows = []
     for name, dataset in sets.items():
         keys = [f"{name}: {index}" for index in chosen[name]]
@@ -224,11 +228,9 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
             colors=("tab:gray", "tab:olive", "tab:pink", "tab:blue"),
         )
         top.set_title(name, fontsize="medium")
-        top.set_yscale("log")
-        label_plainly(top.yaxis)
+        scale_logarithmically(top, "y")
         for axes in (top, bottom):
-            axes.set_xscale("log")
-            label_plainly(axes.xaxis)
+            scale_logarithmically(axes)
             axes.grid(alpha=0.3)
     panels[0][0].set_ylabel("median position error")
     panels[1][0].set_ylabel("ms, stage upon stage")

@@ -20,21 +20,22 @@ from trigpoint.rigid import Rigid3
 from trigpoint.stages import estimate_relative_poses, find_consistent, match_anchors
 from trigpoint_db.build import read_frame
 from trigpoint_db.experiments.noise import COLORS, DUELS, METHODS, OURS, estimate_centers
-from trigpoint_db.experiments.sets import choose, open_map
+from trigpoint_db.experiments.published import load_published
+from trigpoint_db.experiments.sets import choose, identify, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import geometric_mean, markdown, median, number
-from trigpoint_db.figures import label_plainly, make_figure, save_figure
+from trigpoint_db.figures import make_figure, save_figure, scale_logarithmically
 from trigpoint_db.importers.base import Dataset
 from trigpoint_db.poses import Query
 
-# Its table "transl-camera-averaging", in cm: by the folder's name as published, translation and
-# center averaging.
-PAPER_CM = {
-    "chess": ("Chess", 4, 3),
-    "stairs": ("Stairs", 11, 10),
-    "KingsCollege": ("King's", 20, 18),
-    "StMarysChurch": ("St.Mary's", 17, 13),
+# What the paper's columns are called by the folders of the scenes, as published.
+PAPER_SCENES = {
+    "chess": "Chess",
+    "stairs": "Stairs",
+    "KingsCollege": "King's",
+    "StMarysChurch": "St.Mary's",
 }
+PAPER_KINDS = ("Translation", "Center")
 
 
 def measure(
@@ -53,7 +54,7 @@ def measure(
     }
     queries = {name: choose(dataset.queries, max_queries) for name, dataset in sets.items()}
     keys = {name: [f"{name}: {query.name}" for query in chosen] for name, chosen in queries.items()}
-    store.begin("averaging", settings | {"queries": keys})
+    store.begin("averaging", settings | {"queries": keys} | identify(network, sets))
     for name, dataset in sets.items():
         if all(key in store for key in keys[name]):
             continue
@@ -144,9 +145,14 @@ def write_table(result: Mapping[str, Any]) -> str:
     ]
     parts.append("\n".join(verdicts))
     by_set = {row["set"]: row for row in rows}
+    published = load_published()["averaging"]
+    quoted = {
+        title: [f"{published.row(f'{kind} Averaging').cells[column]} cm" for kind in PAPER_KINDS]
+        for column, title in enumerate(published.columns)
+    }
     paper = [
-        [title, f"{theirs} cm", f"{ours} cm", *_centimetres(by_set.get(folder))]
-        for folder, (title, theirs, ours) in PAPER_CM.items()
+        [title, *quoted[title], *_centimetres(by_set.get(folder))]
+        for folder, title in PAPER_SCENES.items()
     ]
     parts.append(
         "The paper's own table (its first), and ours where `--root` gave these scenes:\n\n"
@@ -191,8 +197,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
         )
     axes.set_yticks(range(len(rows)), [row["set"] for row in rows])
     axes.invert_yaxis()
-    axes.set_xscale("log")
-    label_plainly(axes.xaxis)
+    scale_logarithmically(axes)
     axes.set_xlabel(f"median position error, over that of {OURS}")
     axes.grid(axis="x", which="both", alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)

@@ -65,7 +65,6 @@ class Hloc:
         self._ids = {image.name: i for i, image in reconstruction.images.items()}
         config = {"estimation": {"ransac": {"max_error": MAX_ERROR_PX}}}
         self._localizer = self._localize_sfm.QueryLocalizer(reconstruction, config)
-        self.num_points = len(reconstruction.points3D)
 
     @property
     def num_model_bytes(self) -> int:

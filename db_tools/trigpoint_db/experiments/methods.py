@@ -18,10 +18,10 @@ from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import read_frame
 from trigpoint_db.experiments.averaging import describe_choice
-from trigpoint_db.experiments.sets import choose, open_map
+from trigpoint_db.experiments.sets import choose, identify, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import geometric_mean, markdown, median, number
-from trigpoint_db.figures import label_plainly, make_figure, save_figure
+from trigpoint_db.figures import make_figure, save_figure, scale_logarithmically
 from trigpoint_db.importers.base import Dataset
 from trigpoint_db.methods.baseline import Baseline, Estimate
 from trigpoint_db.methods.matched import Matched, match_frame
@@ -36,7 +36,9 @@ ABOUT = {
         "(Zhou et al., ICRA 2020)"
     ),
     MethodName.TRANSLATION_AVERAGING: "eq. 5 in closed form, of the relative poses that agree",
-    MethodName.RELATIVE_POSES: "stage 1 of the paper alone: center and rotation averaging",
+    MethodName.RELATIVE_POSES: (
+        "stage 1 of the paper alone, of all anchors: Proposition 1 and rotation averaging"
+    ),
     MethodName.MAP_PNP: (
         "the anchors' points triangulated by COLMAP, then PnP by COLMAP, as hloc has it"
     ),
@@ -70,7 +72,7 @@ def measure(
     }
     queries = {name: choose(dataset.queries, max_queries) for name, dataset in sets.items()}
     keys = {name: [f"{name}: {query.name}" for query in chosen] for name, chosen in queries.items()}
-    store.begin("methods", settings | {"queries": keys})
+    store.begin("methods", settings | {"queries": keys} | identify(network, sets))
     options = LocalizerOptions(num_anchors=num_anchors, first_anchors=num_anchors)
     for name, dataset in sets.items():
         if all(key in store for key in keys[name]):
@@ -176,8 +178,8 @@ def write_table(result: Mapping[str, Any]) -> str:
         cells.append([f"over that of {OURS}", *(number(mean) for mean in ratios)])
         parts.append(f"{title}:\n\n" + markdown(["set", *methods], cells))
     parts.append(
-        "The last rows are geometric means of ratios, where both numbers are finite.\n\n"
-        + "\n".join(describe_best(rows, key, what) for key, what in WON.items())
+        "The last rows are geometric means of ratios, where both numbers are finite and not zero."
+        "\n\n" + "\n".join(describe_best(rows, key, what) for key, what in WON.items())
     )
     times = [median([row["methods"][name]["ms"] for row in rows]) for name in methods]
     parts.append(
@@ -227,8 +229,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
         )
     axes.set_yticks(range(len(rows)), [row["set"] for row in rows])
     axes.invert_yaxis()
-    axes.set_xscale("log")
-    label_plainly(axes.xaxis)
+    scale_logarithmically(axes)
     axes.set_xlabel(f"median position error, over that of {OURS}")
     axes.grid(axis="x", which="both", alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
@@ -38,7 +39,8 @@ interrupted goes on when it is given again.
 
 The real images are those in `DATA`, a folder for each set with `images/`, a COLMAP model in
 `sparse/`, and two splits: every fifth image is a query, or ("block") whole stretches are. Errors of
-position are in metres for the kitchen, kitti and strecha, else in the model's unit."""
+position are in metres for the kitchen, kitti and strecha, else in the model's unit. kitti's images
+are stereo pairs: of most of its queries the map has the other one, taken at the same instant."""
 
 
 def write_page(results: Path, docs: Path) -> Path:
@@ -46,25 +48,39 @@ def write_page(results: Path, docs: Path) -> Path:
 
     In `docs` are then `experiments.md`, `experiments/*.json` and `images/experiments/*.png`.
     """
+    if not results.is_dir():
+        raise ConfigError(f"there is no folder {results}; name the one that has the results")
     kept, pictures = docs / "experiments", docs / "images" / "experiments"
-    for folder in (kept, pictures):
-        folder.mkdir(parents=True, exist_ok=True)
-    for path in sorted(results.glob("*.json")):
-        if path.stem in SECTIONS:
-            shutil.copyfile(path, kept / path.name)
-    sections = [
-        write_section(name, read_result(path), pictures)
+    files = {
+        name: path
         for name in SECTIONS
-        if (path := kept / f"{name}.json").is_file()
-    ]
-    if not sections:
+        for path in (kept / f"{name}.json", results / f"{name}.json")
+        if path.is_file()
+    }
+    if not files:
         raise ConfigError(
             f"there is no result of an experiment in {results}; `trigpoint-db experiment noise "
             f"--output {results}` measures one"
         )
+    # All is read and drawn before anything in docs changes: a damaged result replaces no good one.
+    with tempfile.TemporaryDirectory() as scratch:
+        sections = [_write_section_of(path, Path(scratch)) for path in files.values()]
+        for folder in (kept, pictures):
+            folder.mkdir(parents=True, exist_ok=True)
+        for name, path in files.items():
+            write_atomically(kept / path.name, path.read_text(encoding="utf-8"))
+            shutil.copyfile(Path(scratch) / f"{name}.png", pictures / f"{name}.png")
     page = docs / "experiments.md"
     write_atomically(page, "\n\n".join([INTRODUCTION, *sections]) + "\n")
     return page
+
+
+def _write_section_of(path: Path, pictures: Path) -> str:
+    result = read_result(path)
+    try:
+        return write_section(path.stem, result, pictures)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise ConfigError(f"{path} is not the result of an experiment; measure it anew") from error
 
 
 def write_section(name: str, result: Mapping[str, Any], pictures: Path) -> str:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,7 @@ from trigpoint.database.reader import MapReader
 from trigpoint.frame import Anchor, quantize_descriptors
 from trigpoint.models.features import FeatureModel
 from trigpoint.models.retrieval import RetrievalModel
+from trigpoint.models.session import hash_files
 from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
 from trigpoint_db.build import read_frame
@@ -42,6 +42,7 @@ Describe = Callable[[NDArray[np.uint8]], Array32]
 
 RANKS = (1, 5, 10, 20)
 NUM_BINS = 10
+MIN_LACK_PERCENT = 1.0  # of the places; of less, a verdict would be noise
 TINY_PX = 16
 
 PACKAGED = "packaged descriptor"
@@ -88,9 +89,10 @@ def measure(
     others: dict[str, Describe] = {TINY: describe_tiny}
     if external is not None:
         others[external.contract.name] = external.describe
+    identity = None if external is None else hash_files(external.network.path)
     settings = {
         "model": model.identity.sha256,
-        "others": list(others),
+        "external": identity,
         "num_anchors": num_anchors,
         "num_queries": num_queries,
         "sets": {name: len(dataset.queries) for name, dataset in sets.items()},
@@ -105,9 +107,9 @@ def measure(
             dataset = sets[name]
         else:
             dataset = _render_room(store.folder / "room", num_survey, num_flight)
-        asked = replace(dataset, queries=choose(dataset.queries, num_queries))
+        chosen = choose(range(len(dataset.queries)), num_queries)
         with open_map(store.folder / "maps", name, dataset, model) as reader:
-            store[name] = _measure_set(name, asked, reader, model, others, num_anchors)
+            store[name] = _measure_set(name, dataset, chosen, reader, model, others, num_anchors)
     return {
         "model": model.identity.name,
         "num_anchors": num_anchors,
@@ -139,15 +141,17 @@ def _render_room(folder: Path, num_survey: int, num_flight: int) -> Dataset:
 def _measure_set(
     name: str,
     dataset: Dataset,
+    chosen: Sequence[int],
     reader: MapReader,
     model: FeatureModel,
     others: Mapping[str, Describe],
     num_anchors: int,
 ) -> dict[str, Any]:
-    """Rank the images of a map for all queries, and count those that see the same."""
+    """Rank the images of a map for the chosen queries, and count those that see the same."""
     asked: dict[str, list[Array32]] = {method: [] for method in (PACKAGED, *others)}
     queries = []
-    for query in track(dataset.queries, f"{name}: queries", len(dataset.queries)):
+    for place in track(chosen, f"{name}: queries", len(chosen)):
+        query = dataset.queries[place]
         image = read_frame(dataset.images, query.name, query.camera).image
         features = model.extract(image)
         asked[PACKAGED].append(features.global_descriptor)
@@ -184,11 +188,15 @@ def _measure_set(
         "num_queries": len(queries),
         "methods": {
             POSSIBLE: _describe_best(is_correct, num_anchors),
-            **{method: _describe_order(orders[method], is_correct) for method in sorted(orders)},
-            CHANCE: _describe_chance(is_correct),
+            **{
+                method: _describe_order(orders[method], is_correct, num_anchors)
+                for method in sorted(orders)
+            },
+            CHANCE: _describe_chance(is_correct, num_anchors),
         },
         "shown": {
-            "query": shown,
+            "query": chosen[shown],
+            "of": len(dataset.queries),
             "images": images.tolist(),
             "is_correct": is_correct[shown, images].tolist(),
         },
@@ -205,12 +213,18 @@ def _rank(queries: Array32, images: Array32, k: int, diversity: float = 0.0) -> 
     return np.stack(orders)
 
 
-def _describe_order(order: Indices, is_correct: Truth) -> dict[str, Any]:
+def _list_ranks(num_anchors: int) -> list[int]:
+    """List the ranks that so many images have."""
+    return [rank for rank in RANKS if rank <= num_anchors]
+
+
+def _describe_order(order: Indices, is_correct: Truth, num_anchors: int) -> dict[str, Any]:
     """Describe orders (Q, k) of images: how often one of the first is correct, how many are."""
     found = np.take_along_axis(is_correct, order, axis=1)
+    ranks = _list_ranks(num_anchors)
     shares = found.mean(axis=1)
     return {
-        "recalls": [float(found[:, :rank].any(axis=1).mean()) for rank in RANKS],
+        "recalls": [float(found[:, :rank].any(axis=1).mean()) for rank in ranks],
         "share": float(shares.mean()),
         "histogram": np.histogram(shares, NUM_BINS, (0, 1))[0].tolist(),
     }
@@ -219,13 +233,15 @@ def _describe_order(order: Indices, is_correct: Truth) -> dict[str, Any]:
 def _describe_best(is_correct: Truth, k: int) -> dict[str, Any]:
     """Describe what an order could have at best, with the correct images that the map has."""
     best = np.argsort(~is_correct, axis=1, kind="stable")[:, :k]
-    return _describe_order(best, is_correct)
+    return _describe_order(best, is_correct, k)
 
 
-def _describe_chance(is_correct: Truth) -> dict[str, Any]:
+def _describe_chance(is_correct: Truth, k: int) -> dict[str, Any]:
     """Describe what to expect of images drawn at random."""
     num_images, num_correct = is_correct.shape[1], is_correct.sum(axis=1)
-    none = [hypergeom.pmf(0, num_images, num_correct, min(rank, num_images)) for rank in RANKS]
+    none = [
+        hypergeom.pmf(0, num_images, num_correct, min(rank, num_images)) for rank in _list_ranks(k)
+    ]
     return {"recalls": [float(1 - p.mean()) for p in none], "share": float(is_correct.mean())}
 
 
@@ -244,7 +260,7 @@ def write_table(result: Mapping[str, Any]) -> str:
     header = [
         "set",
         "images",
-        *(f"top {rank}" for rank in RANKS),
+        *(f"top {rank}" for rank in _list_ranks(result["num_anchors"])),
         f"correct of {result['num_anchors']}",
     ]
     sizes = ", ".join(
@@ -264,8 +280,13 @@ def write_table(result: Mapping[str, Any]) -> str:
 
 
 def _conclude(result: Mapping[str, Any]) -> list[str]:
-    """Say what the numbers say of the descriptors, and of the paper's claims."""
-    sets = result["sets"]
+    """Say what the numbers say of the descriptors, and of the paper's claims.
+
+    They are those of real images, where there are any: the rendered room is unlike them.
+    """
+    real = {name: measured for name, measured in result["sets"].items() if name != ROOM}
+    sets = real or result["sets"]
+    queries = "all queries of real images" if real else "all queries"
     weights = np.array([measured["num_queries"] for measured in sets.values()])
 
     def over_all(method: str) -> tuple[float, float]:
@@ -282,10 +303,9 @@ def _conclude(result: Mapping[str, Any]) -> list[str]:
         for method in methods
     )
     mostly = [name for name, m in sets.items() if m["methods"][PACKAGED]["share"] > 0.5]
-    missing = "mostly not in the map" if 1 - possible > possible - share else "mostly not found"
     return [
         (
-            "Over all queries, the first image is correct, and of the first "
+            f"Over {queries}, the first image is correct, and of the first "
             f"{result['num_anchors']} are, in %: {compared}."
         ),
         (
@@ -294,9 +314,21 @@ def _conclude(result: Mapping[str, Any]) -> list[str]:
             f"{len(mostly)} of {len(sets)} sets ({'; '.join(mostly) or 'none'}). Of the places "
             "that correct images of the map could take, the packaged descriptor fills "
             f"{100 * share / possible:.0f} %, and images drawn at random would fill "
-            f"{100 * over_all(CHANCE)[1] / possible:.0f} %: what lacks is {missing}."
+            f"{100 * over_all(CHANCE)[1] / possible:.0f} %."
+            + _describe_lack(100 * (possible - share), 100 * (1 - possible))
         ),
     ]
+
+
+def _describe_lack(not_found: float, not_mapped: float) -> str:
+    """Say of two percentages which is why images are not correct, unless hardly any are not."""
+    if max(not_found, not_mapped) < MIN_LACK_PERCENT:
+        return ""
+    missing = "not in the map" if not_mapped > not_found else "not found"
+    return (
+        f" Of all places, {not_found:.1f} % lack a correct image that the map has, and "
+        f"{not_mapped:.1f} % one that it has not: what lacks is mostly {missing}."
+    )
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
@@ -332,7 +364,7 @@ def _draw_histograms(figure: SubFigure, result: Mapping[str, Any]) -> None:
 def _draw_recalled(figure: SubFigure, room: Mapping[str, Any]) -> None:
     """Draw a query of the rendered room, and its images in order: green ones are correct."""
     world, shown = make_room(ROOM_SEED), room["shown"]
-    query = flight_poses(world, room["num_queries"], ROOM_SEED)[shown["query"]]
+    query = _find_shown(world, room)
     survey = survey_poses(world, room["num_mapped"], ROOM_SEED)
     grid = figure.add_gridspec(1, 2, width_ratios=(1, 2))
     left, right = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
@@ -342,6 +374,14 @@ def _draw_recalled(figure: SubFigure, room: Mapping[str, Any]) -> None:
     panels = right.subplots(SHOWN_ROWS, SHOWN_COLUMNS).ravel()
     for axes, index, is_correct in zip(panels, shown["images"], shown["is_correct"], strict=False):
         _draw_view(axes, world, survey[index], "tab:green" if is_correct else "tab:red")
+
+
+def _find_shown(world: World, room: Mapping[str, Any]) -> Rigid3:
+    """Return the pose of the query that is drawn."""
+    shown = room["shown"]
+    # A result without the length of the flight is of all its queries.
+    num_flight = shown.get("of", room["num_queries"])
+    return flight_poses(world, num_flight, ROOM_SEED)[shown["query"]]
 
 
 def _draw_view(axes: Axes, world: World, cam_from_world: Rigid3, color: str) -> None:

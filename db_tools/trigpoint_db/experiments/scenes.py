@@ -20,7 +20,7 @@ from trigpoint_db.experiments.scene_notes import write_notes
 from trigpoint_db.experiments.sets import open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import markdown
-from trigpoint_db.figures import label_plainly, make_figure, save_figure
+from trigpoint_db.figures import make_figure, save_figure, scale_logarithmically
 from trigpoint_db.localize import localize_images
 from trigpoint_db.submit import write_submission
 
@@ -243,8 +243,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
         if is_share:
             axes.set_xlim(-3, 103)
         else:
-            axes.set_xscale("log")
-            label_plainly(axes.xaxis)
+            scale_logarithmically(axes)
         axes.set_xlabel(quantity)
         axes.grid(color="0.5", alpha=0.2)
         axes.axhline(sum(row in table.rows for row in rows) - 0.5, color="0.5", linewidth=0.8)

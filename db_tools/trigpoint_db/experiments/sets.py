@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError, TrigpointError
 from trigpoint.models.features import FeatureModel
-from trigpoint_db.build import build_map, check_files, select_images
+from trigpoint_db.build import build_map, check_files, is_taken_so, select_images
 from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.importers import cambridge, seven_scenes
 from trigpoint_db.importers.base import Dataset
@@ -37,6 +38,9 @@ def read_splits(data: Path, pattern: str = "*") -> dict[str, Dataset]:
             names = folder / f"map{suffix}.txt", folder / f"queries{suffix}.txt"
             if all(path.is_file() for path in names):
                 mapped, tested = (select_images(posed, read_names(path)) for path in names)
+                for path, listed in zip(names, (mapped, tested), strict=True):
+                    if not listed:
+                        raise ConfigError(f"{path} names no images")
                 check_files((image.name for image in (*mapped, *tested)), folder / "images")
                 found[folder.name + label] = Dataset.from_split(folder / "images", mapped, tested)
     if not found:
@@ -81,6 +85,24 @@ def find_sets(data: Path, pattern: str = "*") -> list[Path]:
     return folders
 
 
+def fingerprint(dataset: Dataset) -> str:
+    """Return a hash of all that results depend on: the folder, names, cameras and poses."""
+    poses = {image.name: image.cam_from_world for image in dataset.mapped} | dict(dataset.truth)
+    digest = hashlib.sha256(str(dataset.images.resolve()).encode())
+    cameras = [(image.name, image.camera) for image in dataset.mapped]
+    for name, camera in [*cameras, *((query.name, query.camera) for query in dataset.queries)]:
+        digest.update(f"{name} {camera.to_text()}\n".encode())
+    for name, pose in poses.items():
+        digest.update(name.encode() + pose.R.tobytes() + pose.t.tobytes())
+    return digest.hexdigest()
+
+
+def identify(network: FeatureModel, sets: Mapping[str, Dataset]) -> dict[str, Any]:
+    """Say in a run's settings which network and which data it is of."""
+    data = {name: fingerprint(dataset) for name, dataset in sets.items()}
+    return {"sha256": network.identity.sha256, "data": data}
+
+
 @contextmanager
 def open_map(
     folder: Path, name: str, dataset: Dataset, network: FeatureModel
@@ -102,14 +124,13 @@ def open_map(
 
 
 def is_map_of(path: Path, dataset: Dataset, network: FeatureModel) -> bool:
-    """Say whether there is a map of these images and poses, by this network."""
+    """Say whether there is a map of these images, cameras and poses, by this network."""
     if not path.is_file():
         return False
     try:
         with MapReader.open(path, network.identity) as reader:
             return reader.names() == [image.name for image in dataset.mapped] and all(
-                np.allclose(reader.view(i)[1].t, image.cam_from_world.t)
-                for i, image in enumerate(dataset.mapped)
+                is_taken_so(image, *reader.view(i)) for i, image in enumerate(dataset.mapped)
             )
     except TrigpointError:
         return False

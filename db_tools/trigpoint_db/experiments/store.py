@@ -118,14 +118,19 @@ def _line(value: Any) -> str:
 
 
 def _read_lines(path: Path) -> list[Any]:
-    """Read the lines that were written whole."""
+    """Read the settings and the units after them, up to the first line that is damaged."""
     lines: list[Any] = []
     if path.is_file():
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
             try:
-                lines.append(json.loads(line))
+                line = json.loads(text)
             except ValueError:
                 break
+            is_unit = isinstance(line, dict) and isinstance(line.get("key"), str)
+            # All that is written is ASCII: the rest stands for bytes that are not.
+            if not text.isascii() or (lines and not (is_unit and "value" in line)):
+                break
+            lines.append(line)
     return lines
 
 

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from trigpoint_db.evaluate import percentile
+
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], num_words: int = 1) -> str:
     """Lay out a table; all but the first `num_words` columns are numbers."""
@@ -29,11 +31,7 @@ def finite(value: float) -> float | None:
 def median(errors: Sequence[float | None], percent: float = 50) -> float | None:
     """Return a percentile of errors, the median by default; None is a failure, and infinite."""
     known = [math.inf if error is None else error for error in errors]
-    if not known:
-        return None
-    with np.errstate(invalid="ignore"):  # interpolating between two failures
-        value = float(np.percentile(known, percent))
-    return finite(value)
+    return finite(percentile(np.array(known), percent))
 
 
 def geometric_mean(values: Iterable[float | None]) -> float | None:

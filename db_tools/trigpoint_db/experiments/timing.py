@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from trigpoint.database.reader import MapReader
+from trigpoint.errors import ConfigError
 from trigpoint.frame import Anchor, Frame, Localized, Statistics
 from trigpoint.localizer import Localizer
 from trigpoint.models.features import FeatureModel
@@ -32,7 +33,8 @@ from trigpoint_db.experiments.hloc import (
     write_keypoints,
     write_matches,
 )
-from trigpoint_db.experiments.sets import choose, open_map
+from trigpoint_db.experiments.published import load_published
+from trigpoint_db.experiments.sets import choose, identify, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import markdown, median, number
 from trigpoint_db.figures import make_figure, save_figure
@@ -54,9 +56,6 @@ HLOC_FEATURES, HLOC_MODEL = "hloc's features", "hloc's reconstruction"
 PAPER_ANCHORS = 50
 PAPER_COLUMNS = ("NetVLAD", "SuperPoint", RETRIEVAL, "matching (SuperGlue)", LOCALIZATION)
 PAPER_HLOC, PAPER = "HLOC + SG", "the paper's method"
-PAPER_MS = {PAPER_HLOC: (3, 14, 7, 641, 1333), PAPER: (3, 14, 7, 1538, 361)}
-PAPER_TOTAL_MS = {PAPER_HLOC: 1998, PAPER: 1903}
-PAPER_GB = {PAPER_HLOC: 8.544, PAPER: 7.431}
 PAPER_CLAIMS_PERCENT = (5, 10)  # less time, less storage than hloc
 NUM_AACHEN = 4328  # database images of Aachen Day-Night (Sattler et al., CVPR 2018)
 
@@ -81,7 +80,8 @@ def measure(
     joined = join(sets)
     queries = {query.name: query for query in choose(joined.queries, max_queries)}
     settings = {"network": network.identity.name, "sets": list(sets)}
-    store.begin("timing", settings | {"queries": list(queries), "hloc": checkout is not None})
+    chosen = {"queries": list(queries), "hloc": checkout is not None}
+    store.begin("timing", settings | chosen | identify(network, sets))
     if not all(key in store for key in queries):
         with (
             open_map(store.folder / "maps", "all", joined, network) as reader,
@@ -92,7 +92,7 @@ def measure(
                 str(num_anchors): Localizer(
                     network, reader, at_once(num_anchors), time.perf_counter
                 )
-                for num_anchors in NUM_ANCHORS
+                for num_anchors in sorted({min(n, len(joined.mapped)) for n in NUM_ANCHORS})
             } | {AS_NEEDED: Localizer(network, reader, None, time.perf_counter)}
             for key in store.each(list(queries), "timing"):
                 frame = read_frame(joined.images, key, queries[key].camera)
@@ -114,6 +114,8 @@ def measure(
 
 def join(sets: Mapping[str, Dataset]) -> Dataset:
     """Make one data set of all; their worlds' frames, which differ, have no part in times."""
+    if not sets:
+        raise ConfigError("no set has map.txt and queries.txt, the split that is timed")
     root = Path(os.path.commonpath([dataset.images for dataset in sets.values()]))
     mapped, queries = [], []
     for dataset in sets.values():
@@ -157,7 +159,7 @@ def time_query(
     label: str, localizer: Localizer, frame: Frame, rival: Rival | None
 ) -> list[dict[str, Any]]:
     """Localize a frame by a localizer, and by hloc with as many anchors, the same ones."""
-    localizer.localize(frame)  # caches are warm for both
+    localizer.localize(frame)  # once before, as hloc's: caches are warm
     start = time.perf_counter()
     result = localizer.localize(frame)
     total = 1e3 * (time.perf_counter() - start)
@@ -168,6 +170,7 @@ def time_query(
     found = isinstance(result, Localized)
     cases = [case | {"pipeline": OURS, "found": found, "ms": ms}]
     if rival is not None and label != AS_NEEDED:
+        time_rival(rival, localizer, frame, statistics)
         found, ms = time_rival(rival, localizer, frame, statistics)
         cases.append(case | {"pipeline": HLOC, "found": found, "ms": ms})
     return cases
@@ -237,13 +240,15 @@ def write_table(result: Mapping[str, Any]) -> str:
         f"{result['num_mapped']} images (`{result['network']}`); medians in ms. {theirs}"
     )
     parts = [about, markdown(["anchors", "", "localized", *STAGES, TOTAL], cells, num_words=2)]
-    if beyond := [num for num in NUM_ANCHORS if result["largest"] < num <= result["num_mapped"]]:
+    counts = [row["anchors"] for row in rows if row["pipeline"] == OURS]
+    counts = [count for count in counts if count != AS_NEEDED]
+    if beyond := [count for count in counts if int(count) > result["largest"]]:
         parts.append(
-            f"No set has more than {result['largest']} images: of {' or '.join(map(str, beyond))} "
+            f"No set has more than {result['largest']} images: of {' or '.join(beyond)} "
             "anchors some show other places, and what is matched with them is wrong."
         )
     if has_hloc:
-        parts.append("\n".join(f"- {compare(rows, str(num))}" for num in NUM_ANCHORS))
+        parts.append("\n".join(f"- {compare(rows, count)}" for count in counts))
     parts += [write_storage(result["bytes"]), write_paper(rows)]
     return "\n\n".join(parts)
 
@@ -275,36 +280,38 @@ def write_storage(num_bytes: Mapping[str, float]) -> str:
 
 def write_paper(rows: list[Mapping[str, Any]]) -> str:
     """Quote the paper's table, and say what of it adds up."""
+    published = {
+        PAPER if row.pipeline == "Ours" else row.pipeline: [cell or "-" for cell in row.cells]
+        for row in load_published()["timing"].rows
+    }
+    totals = {name: float(cells[-2]) for name, cells in published.items()}
+    gigabytes = {name: float(cells[-1]) for name, cells in published.items()}
     cells = [
-        [name, *map(str, ms), str(PAPER_TOTAL_MS[name]), f"{PAPER_GB[name]}", kilobytes(name)]
-        for name, ms in PAPER_MS.items()
+        [name, *printed, f"{gigabytes[name] * 1e6 / NUM_AACHEN:,.0f}"]
+        for name, printed in published.items()
     ]
-    own = next(row["ms"] for row in rows if row["anchors"] == str(PAPER_ANCHORS))
+    own = [row["ms"][TOTAL] for row in rows if row["anchors"] == str(PAPER_ANCHORS)]
     header = ["", *PAPER_COLUMNS, TOTAL, "GB", "kB an image"]
     notes = [
-        f"The stages of {name} add up to {sum(ms)} ms; its total says {PAPER_TOTAL_MS[name]}."
-        for name, ms in PAPER_MS.items()
+        f"The stages of {name} add up to {sum(map(int, ms))} ms; its total says {total}."
+        for name, (*ms, total, _) in published.items()
     ]
-    faster, smaller = (100 * (1 - of[PAPER] / of[PAPER_HLOC]) for of in (PAPER_TOTAL_MS, PAPER_GB))
+    faster, smaller = (100 * (1 - of[PAPER] / of[PAPER_HLOC]) for of in (totals, gigabytes))
     claims = " and ".join(f"{percent} %" for percent in PAPER_CLAIMS_PERCENT)
     notes.append(
         f"By these totals the paper's method takes {number(faster, 2)} % less time than HLOC + SG "
         f"and {number(smaller, 2)} % less storage; its text says {claims}."
     )
-    notes.append(
-        f"The paper's total is {number(PAPER_TOTAL_MS[PAPER] / own[TOTAL], 2)} times ours with as "
-        "many anchors, but machine, network and images differ."
-    )
+    if own:  # else the map has not as many images
+        notes.append(
+            f"The paper's total is {number(totals[PAPER] / own[0], 2)} times ours with as "
+            "many anchors, but machine, network and images differ."
+        )
     return (
         f'The paper\'s own table ("timing"): ms of one query of Aachen by day on its machine, with '
         f"{PAPER_ANCHORS} images retrieved; kB an image are of {NUM_AACHEN:,} images, as Aachen "
         "Day-Night has.\n\n" + markdown(header, cells) + "\n\n" + "\n".join(f"- {n}" for n in notes)
     )
-
-
-def kilobytes(name: str) -> str:
-    """Return the paper's kB an image."""
-    return f"{PAPER_GB[name] * 1e6 / NUM_AACHEN:,.0f}"
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:

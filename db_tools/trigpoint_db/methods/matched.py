@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from trigpoint.camera import Camera
 from trigpoint.frame import Anchor, Frame, LocalFeatures, Lost, Prior, Reason, Statistics
@@ -12,7 +15,7 @@ from trigpoint.localizer import Localizer
 from trigpoint.models.matching import Matcher
 from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
-from trigpoint.stages import Query, match_anchors
+from trigpoint.stages import Query, estimate_relative_poses, match_anchors
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +77,14 @@ def match_frame(localizer: Localizer, frame: Frame, prior: Prior | None = None) 
         stage_ms=stage_ms,
     )
     return Matched(frame.camera, features, anchors, query, localizer.matcher, statistics)
+
+
+def estimate_each_relative_pose(
+    matched: Matched, options: LocalizerOptions
+) -> tuple[NDArray[np.intp], Rigid3]:
+    """Estimate the relative poses of all anchors, not only of the best."""
+    every = replace(options, num_relative_poses=len(matched.anchors))
+    return estimate_relative_poses(matched.query, every)
 
 
 @contextmanager

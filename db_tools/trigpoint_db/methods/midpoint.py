@@ -10,14 +10,14 @@ from __future__ import annotations
 from trigpoint.frame import Reason
 from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3
-from trigpoint.stages import agree_on_pose, estimate_relative_poses
-from trigpoint_db.methods.matched import Matched
+from trigpoint.stages import agree_on_pose
+from trigpoint_db.methods.matched import Matched, estimate_each_relative_pose
 
 
 def estimate_pose(matched: Matched, options: LocalizerOptions) -> Rigid3 | Reason:
     """Return the best pair's pose: the midpoint between its rays, the mean of its rotations."""
     query = matched.query
-    chosen, query_from_anchors = estimate_relative_poses(query, options)
+    chosen, query_from_anchors = estimate_each_relative_pose(matched, options)
     consensus = agree_on_pose(query.views[chosen], query_from_anchors, options)
     if isinstance(consensus, Reason):
         return consensus
