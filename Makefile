@@ -116,7 +116,7 @@ $(DEMO)/map.tpmap: | $(READY)
 	$(BIN)/trigpoint-db demo $(DEMO)
 
 # The paper's experiments, as far as they need no public data set, and docs/experiments.md; about
-# 12 minutes. What is interrupted goes on. INT8 is compared with FP32 where that network is, times with
+# 14 minutes. What is interrupted goes on. INT8 is compared with FP32 where that network is, times with
 # hloc's where its checkout is named (it needs h5py, tqdm and packaging):
 # make experiments HLOC=../Hierarchical-Localization
 EXPERIMENTS := build/experiments

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
+from hypothesis import settings
 
 from trigpoint.models.features import FeatureModel
 from trigpoint_db.build import build_map
@@ -15,6 +16,8 @@ from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.demo import make_demo
 
 T = TypeVar("T")
+settings.register_profile("untimed", deadline=None)  # machines are shared
+settings.load_profile("untimed")
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 
 

@@ -4,8 +4,8 @@
 
 In the blocks of the page that begin with ```console, lines that begin with `$ ` or follow a
 backslash are commands for the shell; the others are what they printed. A command that ends with
-`&` goes on to the end, and has to print a line first. They run in DIR, a temporary folder by
-default, where DATA is called `data`; pictures of the page that they made are copied beside it.
+`&` goes on to the end; it is waited for until it prints a line. They run in DIR, a temporary folder
+by default, where DATA is called `data`; pictures of the page that they made are copied beside it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ def _run(command: str, folder: Path, background: ExitStack) -> list[str]:
     if command.endswith(" &"):
         background.callback(process.wait)
         background.callback(process.terminate)
-        return [process.stdout.readline().rstrip()]
+        first = process.stdout.readline().rstrip()
+        return [first] if first else []
     printed, said = process.communicate()
     if process.returncode:
         sys.exit(f"exit code {process.returncode}: {said}")

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from trigpoint.errors import TrigpointError
 from trigpoint.models.features import find_model
-from trigpoint.output import check_output, open_text
+from trigpoint.output import check_output, check_place, open_text
 from trigpoint.poses import format_pose
 from trigpointd.config import (
     Config,
@@ -83,7 +83,7 @@ def check_config(config: Annotated[Path, typer.Argument(help="Settings, a TOML f
     if settings.zenoh is not None:
         make_settings(settings.zenoh)
     if settings.log is not None:
-        check_output(LogFiles(settings.log.path).unnumbered())
+        check_place(LogFiles(settings.log.path).unnumbered())
     if settings.foxglove is not None:
         import_sdk()
     with open_pipeline(settings):
@@ -151,7 +151,7 @@ def watch(
         settings = load_settings(zenoh)
     set_endpoints(settings, "connect", tuple(connect or ()))
     set_endpoints(settings, "listen", tuple(listen or ()))
-    check_output(poses)
+    check_output(poses, in_place=True)
     with ExitStack() as stack:
         arriving = stack.enter_context(subscribe(settings, key, exit_with_daemon=exit_with_daemon))
         file = None if poses is None else stack.enter_context(open_text(poses))

@@ -68,7 +68,7 @@ def run(
     inputs = [config.map]
     if isinstance(config.source, McapConfig):
         inputs.append(config.source.path)
-    check_output(poses, *inputs)
+    check_output(poses, *inputs, in_place=True)
     with ExitStack() as stack:
         reloads = stack.enter_context(contextlib.closing(Reloads(config, read)))
         source = open_source(config)

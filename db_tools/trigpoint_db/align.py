@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from trigpoint.errors import ConfigError
-from trigpoint.frame import Localized
+from trigpoint.frame import Failed, Localized, Lost
 from trigpoint.geometry.similarity import SimilarityConsensus, estimate_similarity
 from trigpoint.localizer import Localizer
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.importers.base import PosedImage
 from trigpoint_db.localize import Outcome, localize_images
 from trigpoint_db.poses import Query
+from trigpoint_db.sampling import spread_indices
 
 MIN_AGREEING = 5
 MIN_SHARE = 0.5  # of the localized images: a second similarity cannot have as many
@@ -80,9 +82,11 @@ def align_survey(
         if isinstance(result, Localized)
     ]
     if len(localized) < MIN_AGREEING:
+        lost = Counter(f"{r.reason}: {r.detail}" for r in results if isinstance(r, Lost | Failed))
+        why = f" ({lost.most_common(1)[0][0]})" if lost else ""
         raise ConfigError(
-            f"{len(localized)} of {len(images)} images of the survey were localized in the map; "
-            f"{MIN_AGREEING} are needed: does it show the same place? --sample tries more of them"
+            f"{len(localized)} of {len(images)} images of the survey were localized in the map"
+            f"{why}; {MIN_AGREEING} are needed: does it show the same place, with these cameras?"
         )
     in_survey, in_map, depths = zip(*localized, strict=True)
     consensus = estimate_similarity(
@@ -104,5 +108,4 @@ def align_survey(
 def choose_spread(images: Sequence[PosedImage], num: int) -> list[PosedImage]:
     """Choose so many images, spread over the survey, in order of their names."""
     images = sorted(images, key=lambda image: image.name)
-    places = np.linspace(0, len(images), min(num, len(images)), endpoint=False).astype(int)
-    return [images[i] for i in places]
+    return [images[i] for i in spread_indices(len(images), num)]

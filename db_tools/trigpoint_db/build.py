@@ -11,7 +11,7 @@ import numpy as np
 from trigpoint.camera import Camera
 from trigpoint.database.codec import Profile
 from trigpoint.database.reader import MapReader
-from trigpoint.database.replacing import COMMIT_EVERY, partial_map, resumable_map
+from trigpoint.database.replacing import COMMIT_EVERY, growing_map, name_map, partial_map
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError
 from trigpoint.frame import Frame, LocalFeatures, Session
@@ -74,14 +74,16 @@ def build_map(
     crew: Crew | None = None,
     resume: bool = False,
     profile: Profile | None = None,
+    named: bool = True,
 ) -> int:
     """Write a new map; it appears under its name when it is complete. Returns the image count.
 
     The images are read from `folder` by `read_frame`. The same images in the same order give the
     same bytes, whoever does the work. With `resume`, what an interrupted build of the same images
-    and profile has committed is taken over; an interrupted one leaves the same records then.
+    and profile has committed is taken over; an interrupted one leaves the same records then. One
+    that is not `named` stays in `partial_map`, for more to be done before `name_map`.
     """
-    with resumable_map(path, model.identity, profile, resume=resume) as writer:
+    with growing_map(path, model.identity, profile, resume=resume) as writer:
         remaining = iter(images)
         if len(writer):
             _pass_over(remaining, partial_map(path), session)
@@ -89,7 +91,10 @@ def build_map(
             writer.add(image.name, image.camera, image.cam_from_world, features, session)
             if len(writer) % COMMIT_EVERY == 0:
                 writer.commit()
-        return len(writer)
+        count = len(writer)
+    if named:
+        name_map(partial_map(path), path)
+    return count
 
 
 def _pass_over(images: Iterator[PosedImage], path: Path, session: Session | None) -> None:

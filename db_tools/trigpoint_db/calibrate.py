@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.options import LocalizerOptions
 from trigpoint.stages import mean_distance
 from trigpoint_db.leave_one_out import localize_without
-from trigpoint_db.overlap import spread_indices
+from trigpoint_db.sampling import spread_indices
 
 Array = NDArray[np.float64]
 
@@ -81,6 +81,22 @@ def measure_pose_noise(localizer: Localizer, images: Iterable[int]) -> PoseNoise
         for part, levels in zip(parts, (middle * POSITION, ROTATION_RAD), strict=True)
     )
     return PoseNoise(position[0], position[1] / middle, rotation[0], rotation[1] / middle)
+
+
+def describe_noise(noise: PoseNoise | None) -> str:
+    """Say for people how well the poses of a map agree."""
+    if noise is None:
+        return (
+            "how well its poses agree is not known: too few of its images could be localized, or "
+            "`trigpoint-db calibrate` has not been run since they came together"
+        )
+    if not any(astuple(noise)):
+        return "its poses agree as well as can be measured"
+    return (
+        f"its poses agree to {noise.position:.2g} and {noise.position_drift * 100:.2g} % of their "
+        f"distance, {np.rad2deg(noise.rotation_rad):.2g} degrees and "
+        f"{np.rad2deg(noise.rotation_drift_rad):.2g} for each unit of it"
+    )
 
 
 def _fit(errors: Array, covariances: Array, distances: Array, levels: Array) -> tuple[float, float]:

@@ -11,6 +11,7 @@ import typer
 from trigpoint.errors import TrigpointError
 from trigpoint_db.commands import (
     build,
+    coverage,
     datasets,
     experiments,
     fleet,
@@ -29,7 +30,18 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for commands in (build, results, maps, survey, report, datasets, recordings, networks, fleet):
+for commands in (
+    build,
+    results,
+    maps,
+    survey,
+    coverage,
+    report,
+    datasets,
+    recordings,
+    networks,
+    fleet,
+):
     app.add_typer(commands.app)  # on the same level
 experiments.app.add_typer(scenes.app)
 app.add_typer(experiments.app, name="experiment")

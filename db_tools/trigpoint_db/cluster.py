@@ -8,6 +8,7 @@ from typing import Self, TypeVar
 
 import dask
 from distributed import Client, KilledWorker
+from distributed.comm import get_address_host_port
 
 from trigpoint.errors import ConfigError
 
@@ -32,6 +33,7 @@ class Cluster:
         self._address = address
         dask.config.set({"distributed.admin.large-graph-warning-threshold": _MAX_IMAGE_BYTES})
         try:
+            get_address_host_port(address)  # a client of none hangs when it is let go
             self._client = Client(address, timeout=patience_s, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ConfigError(
@@ -62,8 +64,8 @@ class Cluster:
         self._client.close()
         if isinstance(error, CancelledError):
             raise ConfigError(
-                f"--cluster: the scheduler at {self._address} has gone; start it again, and go on "
-                "with --resume"
+                f"--cluster: the scheduler at {self._address} has gone; start it again, and the "
+                "same command with --resume (build) or --skip-existing (add) goes on"
             ) from error
         if isinstance(error, RuntimeError | ImportError):
             reason = str(error.__cause__ or error).partition("\n")[0]

@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trigpoint.errors import ConfigError
-from trigpoint.frame import Localized, Reason, summarize
+from trigpoint.frame import Localized, Lost, Reason, Result, Statistics, summarize
 from trigpoint.localizer import Localizer
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.leave_one_out import localize_without
-from trigpoint_db.overlap import NUM_SAMPLED, measure_depth, read_poses_of, spread_indices
+from trigpoint_db.overlap import NUM_SAMPLED, measure_depth
+from trigpoint_db.sampling import spread_indices
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,6 @@ ENOUGH_ANCHORS = 4
 MAX_STD_RATIO = 0.02  # of the position, by the median depth
 WRONG_SHARE = 0.05  # of the median depth: a pose that is off by more is wrong
 WRONG_ANGLE_DEG = 10.0
-NUM_SECTORS = 8  # of headings
 
 
 class Grade(StrEnum):
@@ -66,8 +66,8 @@ class Probe:
     rotation_error_deg: float
     position_std: float  # along the axis of the largest
     stage_ms: dict[str, float]
-    strong_reach: float = 0.0  # view distance of the nearest image left when it was last strong
-    reach: float = 0.0  # and when it was last localized
+    strong_reach: float  # view distance of the nearest image left when it was last strong
+    reach: float  # and when it was last localized
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,31 +105,24 @@ class Coverage:
         """Two unit vectors (2, 3), to the right and to the top of a view from above."""
         return horizontal_axes(self.up)
 
+    @property
+    def probed(self) -> Rigid3:
+        """cam_from_world of the images that were tried (P,)."""
+        return Rigid3.stack(probe.cam_from_world for probe in self.probes)
+
     def distance_to_images(self, pose: Rigid3) -> float:
         """Return the view distance of a pose to the nearest image of the map."""
         return float(view_distance(self.images_from_world, pose, self.median_depth).min())
 
     def expect(self, pose: Rigid3) -> Grade:
         """Say what to expect of a frame, by how far images reach where the nearest probe was."""
-        probed = Rigid3.stack(probe.cam_from_world for probe in self.probes)
-        probe = self.probes[int(view_distance(probed, pose, self.median_depth).argmin())]
+        probe = self.probes[int(view_distance(self.probed, pose, self.median_depth).argmin())]
         distance = self.distance_to_images(pose)
         if distance <= self.apart:
             return probe.grade
         if distance <= probe.strong_reach:
             return Grade.STRONG
         return Grade.THIN if distance <= probe.reach else Grade.BLIND
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A square of the ground and a sector of headings: the images taken there, looking there."""
-
-    column: int
-    row: int
-    sector: int  # counterclockwise from the axis to the right; the first one is centred on it
-    grade: Grade  # the middle one of its images, the worse of two
-    num_images: int
 
 
 def measure_coverage(
@@ -158,6 +151,9 @@ def measure_coverage(
     reader = localizer.reader
     if len(reader) < 3:
         raise ConfigError(f"the map holds {len(reader)} images; its coverage takes three at least")
+    poses = reader.poses()
+    if up is None:
+        up = mean_up(poses)
     long_side_px = localizer.model.long_side_px
     depth = measure_depth(reader, spread_indices(len(reader), NUM_SAMPLED), long_side_px)
     if np.isnan(depth):
@@ -165,28 +161,81 @@ def measure_coverage(
             "no two images of the map show the same from different places: nothing can be "
             "localized with it"
         )
-    poses = read_poses_of(reader)
+    names = reader.names()
     probes = tuple(
-        _probe(localizer, index, view_distance(poses, poses[index], depth), apart, depth)
+        _probe(localizer, index, names[index], poses, apart, depth)
         for index in track(spread_indices(len(reader), num_probes))
     )
-    return Coverage(probes, poses, depth, apart, mean_up(poses) if up is None else up)
+    return Coverage(probes, poses, depth, apart, up)
 
 
-def _probe(localizer: Localizer, index: int, distances: Array, apart: float, depth: float) -> Probe:
+def _probe(
+    localizer: Localizer, index: int, name: str, poses: Rigid3, apart: float, depth: float
+) -> Probe:
     """Localize an image without its surroundings, the closer ones, then wider ones as well."""
-    probe = _localize_apart(localizer, index, distances, apart, depth)
-    wider = probe
+    pose = poses[index]
+    distances = view_distance(poses, pose, depth)
+    probe = wider = _localize_apart(localizer, index, name, pose, distances, apart, depth)
     for factor in WIDER:
         if wider.grade is Grade.BLIND:
             break
-        wider = _localize_apart(localizer, index, distances, apart * factor, depth)
+        wider = _localize_apart(localizer, index, name, pose, distances, apart * factor, depth)
         probe = replace(
             probe,
             strong_reach=max(probe.strong_reach, wider.strong_reach),
             reach=max(probe.reach, wider.reach),
         )
     return probe
+
+
+def _localize_apart(
+    localizer: Localizer,
+    index: int,
+    name: str,
+    pose: Rigid3,
+    distances: Array,
+    apart: float,
+    depth: float,
+) -> Probe:
+    """Localize an image of the map without those at a view distance (N,) below `apart`."""
+    is_near = distances < apart
+    held_out = localize_without(localizer, index, np.flatnonzero(is_near).tolist())
+    result: Result = Lost(Reason.FEW_ANCHORS, Statistics())
+    if held_out is not None:
+        result = held_out.solution.result
+    statistics = result.statistics
+    depth = statistics.depth if statistics.depth > 0 else depth
+    num_anchors = sum(count >= MIN_SEEN for count in statistics.anchor_inliers)
+    grade, outcome = Grade.BLIND, summarize(result)
+    position_error = angle_deg = position_std = np.nan
+    if isinstance(result, Localized):
+        found = result.cam_from_world
+        position_error = float(np.linalg.norm(found.center - pose.center))
+        angle_deg = float(np.rad2deg(rotation_angle(found.R @ pose.R.T)))
+        position_std = float(np.sqrt(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]))
+        if position_error > WRONG_SHARE * depth or angle_deg > WRONG_ANGLE_DEG:
+            outcome = "WRONG_POSE"
+        elif num_anchors >= ENOUGH_ANCHORS and position_std <= MAX_STD_RATIO * depth:
+            grade = Grade.STRONG
+        else:
+            grade = Grade.THIN
+    reach = 0.0 if grade is Grade.BLIND else float(distances[~is_near].min())
+    return Probe(
+        index,
+        name,
+        pose,
+        grade,
+        outcome,
+        num_left_out=int(is_near.sum()) - 1,
+        num_anchors=num_anchors,
+        depth=depth,
+        position_error=position_error,
+        rotation_error_deg=angle_deg,
+        position_std=position_std,
+        stage_ms=statistics.stage_ms,
+        strong_reach=reach if grade is Grade.STRONG else 0.0,
+        reach=reach,
+    )
 
 
 def view_distance(a: Rigid3, b: Rigid3, depth: float) -> Array:
@@ -216,89 +265,6 @@ def horizontal_axes(up: Array) -> Array:
     right = x - (x @ up) * up
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(up, right)])
-
-
-def headings(poses: Rigid3, axes: Array) -> Array:
-    """Return where cameras (...) look, in radians counterclockwise from the first axis."""
-    ahead = poses.R[..., 2, :] @ axes.T
-    angles: Array = np.arctan2(ahead[..., 1], ahead[..., 0])
-    return angles
-
-
-def count_cells(coverage: Coverage, size: float) -> list[Cell]:
-    """Grade squares of the ground of a size in the map's unit, by sectors of headings."""
-    poses = Rigid3.stack(probe.cam_from_world for probe in coverage.probes)
-    places = np.floor(poses.center @ coverage.axes.T / size).astype(int)
-    sector_rad = 2 * np.pi / NUM_SECTORS
-    sectors = np.round(headings(poses, coverage.axes) / sector_rad).astype(int) % NUM_SECTORS
-    found: dict[tuple[int, int, int], list[int]] = {}
-    for probe, place, sector in zip(coverage.probes, places, sectors, strict=True):
-        grade = GRADES.index(probe.grade)
-        found.setdefault((int(place[0]), int(place[1]), int(sector)), []).append(grade)
-    return [
-        Cell(*where, GRADES[sorted(grades)[len(grades) // 2]], len(grades))
-        for where, grades in sorted(found.items())
-    ]
-
-
-def cell_size(coverage: Coverage) -> float:
-    """Choose a size of cells: 1, 2 or 5 times a power of ten, some 12 over the longer side."""
-    places = np.array([p.cam_from_world.center for p in coverage.probes]) @ coverage.axes.T
-    wanted = max(float(np.ptp(places, axis=0).max()) / 12, 0.05 * coverage.median_depth)
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(next(step * power for step in (1, 2, 5, 10) if step * power >= wanted))
-
-
-def _localize_apart(
-    localizer: Localizer, index: int, distances: Array, apart: float, depth: float
-) -> Probe:
-    """Localize an image of the map without those at a view distance (N,) below `apart`."""
-    is_near = distances < apart
-    held_out = localize_without(localizer, index, np.flatnonzero(is_near).tolist())
-    camera_pose = localizer.reader.view(index)[1]
-    nothing = Probe(
-        index,
-        localizer.reader.anchor(index).name,
-        camera_pose,
-        Grade.BLIND,
-        Reason.FEW_ANCHORS.value,
-        num_left_out=int(is_near.sum()) - 1,
-        num_anchors=0,
-        depth=depth,
-        position_error=np.nan,
-        rotation_error_deg=np.nan,
-        position_std=np.nan,
-        stage_ms={},
-    )
-    if held_out is None:
-        return nothing
-    result = held_out.solution.result
-    statistics = result.statistics
-    tried = replace(
-        nothing,
-        outcome=summarize(result),
-        num_anchors=sum(count >= MIN_SEEN for count in statistics.anchor_inliers),
-        depth=statistics.depth if statistics.depth > 0 else depth,
-        stage_ms=statistics.stage_ms,
-    )
-    if not isinstance(result, Localized):
-        return tried
-    found, truth = result.cam_from_world, held_out.truth
-    tried = replace(
-        tried,
-        position_error=float(np.linalg.norm(found.center - truth.center)),
-        rotation_error_deg=float(np.rad2deg(rotation_angle(found.R @ truth.R.T))),
-        position_std=float(np.sqrt(np.linalg.eigvalsh(result.covariance[:3, :3])[-1])),
-    )
-    if (
-        tried.position_error > WRONG_SHARE * tried.depth
-        or tried.rotation_error_deg > WRONG_ANGLE_DEG
-    ):
-        return replace(tried, outcome="WRONG_POSE")
-    reach = float(distances[~is_near].min())
-    if tried.num_anchors >= ENOUGH_ANCHORS and tried.position_std <= MAX_STD_RATIO * tried.depth:
-        return replace(tried, grade=Grade.STRONG, strong_reach=reach, reach=reach)
-    return replace(tried, grade=Grade.THIN, reach=reach)
 
 
 def summary(coverage: Coverage) -> dict[str, Any]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from trigpoint.errors import ConfigError
+from trigpoint.output import check_output, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,6 +19,14 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".svg", ".pdf")
 
 
+def require_matplotlib() -> None:
+    """Refuse to draw where matplotlib is not installed; best before the work."""
+    if find_spec("matplotlib") is None:
+        raise ConfigError(
+            "drawing needs matplotlib; install it with: pip install 'trigpoint[plots]'"
+        )
+
+
 def make_figure(
     width_in: float,
     height_in: float,
@@ -24,37 +34,37 @@ def make_figure(
     layout: Literal["constrained", "compressed"] = "constrained",
 ) -> Figure:
     """Make an empty figure."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ConfigError(
-            "drawing needs matplotlib; install it with: pip install 'trigpoint[plots]'"
-        ) from error
+    require_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure((width_in, height_in), dpi=150, layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
 
-def check_picture(path: Path) -> None:
-    """Refuse a picture of a kind that cannot be drawn."""
+def check_picture(path: Path | None, *inputs: Path) -> None:
+    """Refuse, before any work is done, a picture that cannot be drawn or must not be written."""
+    if path is None:
+        return
+    check_output(path, *inputs)
     if path.suffix.lower() not in PICTURES:
         raise ConfigError(f"cannot draw {path}; name it {' or '.join(PICTURES)}")
+    require_matplotlib()
 
 
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure as the kind of picture that the file's name ends in."""
     check_picture(path)
-    try:
-        figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+    file = io.BytesIO()
+    figure.savefig(file, format=path.suffix[1:].lower(), bbox_inches="tight", pad_inches=0.1)
+    write_atomically(path, file.getvalue())
 
 
 def scale_logarithmically(axes: Axes, which: Literal["x", "y"] = "x") -> None:
     """Make an axis that has anything on it logarithmic, labelled 0.1, 0.2, 0.5, 1 ...
 
-    A long one is labelled 0.1, 1, 10 ...
+    A longer one is labelled 0.1, 0.3, 1 ..., and a long one 0.1, 1, 10 ...
     """
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
@@ -63,7 +73,8 @@ def scale_logarithmically(axes: Axes, which: Literal["x", "y"] = "x") -> None:
         return
     axes.set(**{f"{which}scale": "log"})
     low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1,) if high > 100 * low > 0 else (1, 2, 5)))
+    steps = (1, 2, 5) if high <= 100 * low else (1, 3) if high <= 1000 * low else (1,)
+    axis.set_major_locator(LogLocator(subs=steps))
     axis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.set_minor_formatter(NullFormatter())
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from trigpoint.database.reader import MapReader
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.coverage import Coverage, Grade, view_distance
-from trigpoint_db.overlap import spread_indices
+from trigpoint_db.sampling import spread_indices
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,8 @@ def find_gaps(reader: MapReader, coverage: Coverage) -> list[Place]:
     A gap is between two images with none in between (neighbours in the Gabriel graph) that are
     farther apart than twice `Coverage.apart`: in the middle a frame would be farther from both
     than that. The places are on the way from one to the other, and what to expect there follows
-    from how far the images at the ends reach.
+    from how far the images at the ends reach. Of a large map `MAX_COMPARED` images are compared;
+    places nearer than `Coverage.apart` to any image at all are left out.
     """
     chosen = spread_indices(len(reader), MAX_COMPARED)
     views, names = coverage.images_from_world[np.array(chosen)], reader.names()
@@ -63,7 +64,11 @@ def find_gaps(reader: MapReader, coverage: Coverage) -> list[Place]:
         reason = f"{between}, which are {far:.3g} and {angle_deg:.0f} degrees apart"
         num_steps = int(np.ceil(distances[i, j] / (2 * coverage.apart)))
         on_the_way = _between(views[i], views[j], num_steps)
-        places += [Place(pose, coverage.expect(pose), reason) for pose in on_the_way]
+        places += [
+            Place(pose, coverage.expect(pose), reason)
+            for pose in on_the_way
+            if coverage.distance_to_images(pose) > coverage.apart
+        ]
     return places
 
 

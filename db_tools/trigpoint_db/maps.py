@@ -78,7 +78,7 @@ def split_map(path: Path, box: Sequence[float], out: Path, *, track: Track = ite
     with MapReader.open(path) as reader:
         if len(reader) == 0:
             raise ConfigError(f"{path} holds no images to split")
-        centers = np.array([reader.view(i)[1].center for i in range(len(reader))])
+        centers = reader.poses().center
         inside = ((low <= centers) & (centers <= high)).all(axis=1)
         if not inside.any():
             extent = f"from {centers.min(axis=0)} to {centers.max(axis=0)}"

@@ -100,8 +100,9 @@ def measure_overlap(
     most, depth = 0, math.nan
     for other in find_neighbors(reader, index, features):
         shared = verify_pair(features, image, reader.anchor(other), long_side_px)
-        if len(shared.matches) > most or math.isnan(depth):
-            most, depth = max(most, len(shared.matches)), shared.depth
+        if math.isnan(depth) or (len(shared.matches) > most and not math.isnan(shared.depth)):
+            depth = shared.depth
+        most = max(most, len(shared.matches))
         if most >= enough and not math.isnan(depth):
             break
     return most, depth
@@ -112,14 +113,3 @@ def measure_depth(reader: MapReader, indices: Iterable[int], long_side_px: int) 
     depths = [measure_overlap(reader, i, long_side_px, enough=1)[1] for i in indices]
     known = [depth for depth in depths if not math.isnan(depth)]
     return float(np.median(known)) if known else math.nan
-
-
-def read_poses_of(reader: MapReader) -> Rigid3:
-    """Return cam_from_world (N,) of all images of a map."""
-    return Rigid3.stack(reader.view(index)[1] for index in range(len(reader)))
-
-
-def spread_indices(num_images: int, num: int) -> list[int]:
-    """Choose so many indices, spread evenly."""
-    num = min(num, num_images)
-    return [i * num_images // num for i in range(num)]

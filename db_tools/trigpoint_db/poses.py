@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +14,15 @@ import numpy as np
 from trigpoint.camera import Camera
 from trigpoint.errors import ConfigError
 from trigpoint.frame import Prior
-from trigpoint.output import check_output
+from trigpoint.output import write_atomically
 from trigpoint.poses import format_pose
 from trigpoint.rigid import Rigid3
 
 # Names may hold spaces: the camera begins at the first word followed by the two sizes.
 _QUERY = re.compile(r"(?P<name>\S.*?)\s+(?P<camera>[A-Z][A-Z_]*\s+\d+\s+\d+\s.*)")
+
+
+_BOM = "\ufeff"  # which says at the begin of a file that it is UTF-8
 
 
 @dataclass(frozen=True)
@@ -34,10 +38,17 @@ def read_names(path: Path) -> list[str]:
     names: dict[str, None] = {}
     for where, line in read_entries(path):
         match = _QUERY.fullmatch(line)
-        name = line if match is None else match["name"]
+        name = match["name"] if match and _are_numbers(match["camera"].split()[1:]) else line
         check_new(where, name, names)
         names[name] = None
     return list(names)
+
+
+def _are_numbers(words: Iterable[str]) -> bool:
+    try:
+        return all(math.isfinite(float(word)) for word in words)
+    except ValueError:
+        return False
 
 
 def read_queries(path: Path) -> list[Query]:
@@ -101,7 +112,12 @@ def _check_names(path: Path, names: Iterable[str]) -> None:
 
 def is_writable(name: str) -> bool:
     """Say whether a name survives being written to a line of text and read again."""
-    return bool(name) and name.isprintable() and name == name.strip()
+    try:
+        name.encode()
+    except UnicodeEncodeError:  # of a file whose name is not UTF-8
+        return False
+    is_text = all(unicodedata.category(char) != "Cc" for char in name)
+    return bool(name) and name == name.strip() and is_text and name[0] != _BOM
 
 
 def pose_from_center(where: str, wxyz: Sequence[float], center: Sequence[float]) -> Rigid3:
@@ -114,7 +130,7 @@ def pose_from_numbers(where: str, values: Sequence[float]) -> Rigid3:
     """Make cam_from_world of qw qx qy qz tx ty tz; `where` says where they stand."""
     if not all(map(math.isfinite, values)):
         raise ConfigError(f"{where}: the pose {format_numbers(*values)} is not finite")
-    if not 1e-9 < math.hypot(*values[:4]) < 1e9:  # far from 1, it is not a quaternion
+    if not 0.1 < math.hypot(*values[:4]) < 10:  # far from 1, it is not a quaternion
         raise ConfigError(
             f"{where}: the quaternion {format_numbers(*values[:4])} is not one of a rotation; "
             "it comes first, as qw qx qy qz, and has length 1"
@@ -140,21 +156,6 @@ def read_lines(path: Path) -> Iterator[tuple[str, str]]:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"cannot read {path}: it is not UTF-8 text") from error
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file that appears under its name once it is whole."""
-    check_output(path)
-    path = path.resolve()  # through a link, to what it names
-    partial = path.with_name(path.name + ".partial")
-    try:
-        try:
-            partial.write_text(text, encoding="utf-8", newline="\n")
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
 
 
 def read_entries(path: Path) -> Iterator[tuple[str, str]]:

@@ -7,6 +7,7 @@ kept, then the next sharpest that none kept so far makes needless, and so on.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -23,7 +24,7 @@ from trigpoint.database.reader import MapReader
 from trigpoint.errors import ConfigError
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import read_frame
-from trigpoint_db.overlap import measure_overlap, read_poses_of
+from trigpoint_db.overlap import measure_overlap
 
 Array = NDArray[np.float64]
 
@@ -159,7 +160,9 @@ def select(
     track : callable, optional
         Shows progress.
     """
-    names, poses, new = reader.names(), read_poses_of(reader), range(first, len(reader))
+    names, poses, new = reader.names(), reader.poses(), range(first, len(reader))
+    if not new:
+        return Selection(0, math.nan, ())
     blur, num_shared, depth = _measure(reader, folder, long_side_px, track(new), first)
     flaws: dict[int, tuple[Flaw, str]] = {}
     for i, excess in zip(new, blur[first:] - running_median(blur[first:]), strict=True):
@@ -172,9 +175,9 @@ def select(
 
     def leave_out_near(flaw: Flaw, why: str, *limits: Any) -> None:
         sharpest = sorted(new, key=lambda i: blur[i])
-        order = [*range(first), *(i for i in sharpest if i not in flaws)]
-        near = find_needless(poses, order, *limits)
-        flaws.update({i: (flaw, f"{why} {names[j]}") for i, j in near.items() if i >= first})
+        order = [i for i in sharpest if i not in flaws]
+        near = find_needless(poses, order, *limits, first=first)
+        flaws.update({i: (flaw, f"{why} {names[j]}") for i, j in near.items()})
 
     def are_alike(i: int, j: int) -> bool:
         a, b = reader.features(i).global_descriptor, reader.features(j).global_descriptor
@@ -238,6 +241,8 @@ def find_needless(
     distance: float,
     angle_deg: float,
     are_alike: Callable[[int, int], bool] | None = None,
+    *,
+    first: int = 0,
 ) -> dict[int, int]:
     """Go through images, keep each that no kept one is near; return the others.
 
@@ -251,6 +256,8 @@ def find_needless(
         Images whose centers and rotations are no farther apart than this are near.
     are_alike : callable, optional
         What two images that are near have to be as well.
+    first : int
+        The images before this one are kept.
 
     Returns
     -------
@@ -260,7 +267,7 @@ def find_needless(
     if not np.isfinite(distance) or not order:
         return {}
     centers, needless = cam_from_world.center, dict[int, int]()
-    tree, is_kept = KDTree(centers), np.zeros(len(centers), bool)
+    tree, is_kept = KDTree(centers), np.arange(len(centers)) < first
     for i in order:
         near = np.array(tree.query_ball_point(centers[i], distance), np.intp)
         near = near[is_kept[near]]

@@ -1,8 +1,10 @@
-"""What the commands share: arguments of the same meaning, progress bars, tables."""
+"""What the commands share: arguments of the same meaning, progress bars, hints."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Generator, Iterable, Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -28,6 +30,7 @@ MapProfile = Annotated[
     Profile | None,
     typer.Option("--profile", help="standard, or compact: a third of the size, less precise."),
 ]
+Keypoints = Annotated[int, typer.Option(help="At most so many an image.", min=50)]
 SessionName = Annotated[
     str | None, typer.Option("--session", help="What survey the images are of, a name.")
 ]
@@ -53,3 +56,13 @@ def make_session(name: str | None, day: datetime | None) -> Session | None:
     if name is None and day is not None:
         raise ConfigError("--date is that of a session; give its name with --session")
     return None if name is None else Session(name, day and day.date())
+
+
+@contextmanager
+def hint_at(option: str) -> Iterator[None]:
+    """Say after an interruption how the command goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.stderr.write(f"trigpoint-db: interrupted; the same command goes on with {option}\n")
+        raise

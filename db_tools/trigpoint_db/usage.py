@@ -30,7 +30,7 @@ def count_usage(logs: Iterable[Path]) -> tuple[dict[str, Usage], int]:
     """Count for each image that frames were matched with; returns the number of frames, too."""
     usage: dict[str, Usage] = {}
     num_frames = 0
-    for log in logs:
+    for log in {log.resolve(): log for log in logs}.values():
         for topic, data in read_statuses(log):
             num_frames += 1
             try:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,7 +16,7 @@ from itertools import islice
 from multiprocessing.connection import Connection
 from typing import Protocol, Self, TypeVar, cast
 
-from trigpoint.errors import SourceError
+from trigpoint.errors import SourceError, TrigpointError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -106,7 +108,7 @@ class _Process:
     def do(self, work: Callable[[Item], Result], item: Item) -> Result:
         try:
             self._pipe.send((work, item))
-            result, error = self._pipe.recv()
+            result, error = pickle.loads(self._pipe.recv_bytes())
         except (EOFError, OSError) as error:
             self.kill()
             raise WorkerDiedError from error
@@ -122,14 +124,21 @@ class _Process:
 def _serve(pipe: Connection) -> None:
     """Work until the process at the other end closes its pipe, or ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for that one
-    with suppress(EOFError, OSError):
+    with suppress(EOFError, OSError, MemoryError):
         while True:
-            work, item = pipe.recv()
-            try:
-                answer: tuple[object, Exception | None] = work(item), None
-            except Exception as error:  # raised again at the other end
-                answer = None, error
-            pipe.send(answer)
+            pipe.send_bytes(_answer(*pipe.recv()))
+
+
+def _answer(work: Callable[[Item], Result], item: Item) -> bytes:
+    """Pickle a result, or the error to be raised in its place at the other end."""
+    try:
+        return pickle.dumps((work(item), None))
+    except (TrigpointError, OSError) as error:
+        return pickle.dumps((None, error))
+    except MemoryError:  # another process may have more
+        raise
+    except Exception:  # which may not be one that can be pickled
+        return pickle.dumps((None, RuntimeError(traceback.format_exc())))
 
 
 def do_in_order(

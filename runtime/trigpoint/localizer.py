@@ -184,7 +184,8 @@ class Localizer:
                 prior=prior,
             )
         if len(indices) < 2:
-            detail = f"the map holds {len(indices) or 'no'} image that may be used"
+            around = " around the prior position" if prior else ""
+            detail = f"{len(indices)} images of the map may be used{around}; a pose takes 2"
             return trace.lost(Reason.FEW_ANCHORS, detail)
         retrieved = dict(zip(indices.tolist(), similarities.tolist(), strict=True))
         return self._solve_in_rounds(frame, features, retrieved, trace, deadline)

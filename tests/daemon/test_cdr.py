@@ -42,7 +42,7 @@ def rosbags_message(
 
 
 @given(times, names, poses, covariances)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_a_pose_has_the_bytes_that_rosbags_writes(
     time_ns: int, frame_id: str, pose: Rigid3, covariance: NDArray[np.float64]
 ) -> None:
@@ -51,7 +51,7 @@ def test_a_pose_has_the_bytes_that_rosbags_writes(
 
 
 @given(times, names, poses, covariances, st.booleans())
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_a_pose_that_rosbags_wrote_is_read_in_either_byte_order(
     time_ns: int,
     frame_id: str,

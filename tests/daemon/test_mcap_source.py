@@ -419,7 +419,7 @@ def frames_in_whole_chunks(path: Path, length: int) -> list[int]:
 
 
 @given(st.floats(0, 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_recording_cut_off_anywhere_plays_its_whole_chunks(
     tmp_path_factory: pytest.TempPathFactory, share: float
 ) -> None:
@@ -456,7 +456,7 @@ def test_a_recording_that_ends_in_zeros_plays_its_whole_chunks(tmp_path: Path) -
 
 
 @given(st.data())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_whatever_bytes_are_wrong_only_a_source_error_comes_of_it(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:

@@ -322,9 +322,7 @@ REQUESTS = st.builds(
 )
 
 
-@settings(
-    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(request=REQUESTS)
 def test_every_request_gets_an_answer_of_one_line(ask_small: Asker, request: Request) -> None:
     answer = ask_small.responder.answer(request)

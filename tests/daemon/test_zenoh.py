@@ -214,7 +214,6 @@ def test_whatever_a_peer_sends_is_answered_and_poses_keep_coming(
 
         @settings(
             max_examples=25,
-            deadline=None,
             suppress_health_check=[HealthCheck.function_scoped_fixture],
         )
         @given(

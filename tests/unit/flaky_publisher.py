@@ -1,6 +1,7 @@
-"""A publisher at fault: python -m tests.unit.flaky_publisher MAP KEY ENDPOINT dies|stalls|lies.
+"""A publisher at fault: python -m tests.unit.flaky_publisher MAP KEY ENDPOINT FAULT.
 
-After three chunks it dies, or does not answer any more. Or it alters a byte of one.
+After three chunks it `dies`, or `stalls`: does not answer any more. Or it `lies`: alters a byte of
+one chunk. Or it `lacks` that chunk.
 """
 
 import os
@@ -31,7 +32,7 @@ def publish(map_: Path, key: str, endpoint: str, fault: str) -> None:
             query.reply(f"{key}/manifest", offer.manifest.model_dump_json().encode())
 
     def reply_chunk(query: zenoh.Query) -> None:
-        if fault != "lies" and next(numbers) >= NUM_CHUNKS:
+        if fault in ("dies", "stalls") and next(numbers) >= NUM_CHUNKS:
             if fault == "dies":
                 os.kill(os.getpid(), signal.SIGKILL)
             kept.append(query)
@@ -39,9 +40,13 @@ def publish(map_: Path, key: str, endpoint: str, fault: str) -> None:
         digest = str(query.key_expr).rpartition("/")[2]
         data = offer.read(digest)
         assert data is not None
-        if fault == "lies" and digest == offer.manifest.chunks[1]:
+        is_at_fault = digest == offer.manifest.chunks[1]
+        if fault == "lies" and is_at_fault:
             data = data[:-1] + bytes([data[-1] ^ 1])
         with query:
+            if fault == "lacks" and is_at_fault:
+                query.reply_err("not in this generation")
+                return
             query.reply(str(query.key_expr), data)
 
     session.declare_queryable(f"{key}/manifest", reply_manifest, complete=True)

@@ -92,6 +92,22 @@ def test_an_aligned_survey_can_be_added_at_once_as_a_session(
     require_back(demo, [PosedImage(a.name, a.camera, a.cam_from_world) for a in added], 0.03)
 
 
+def test_an_aligned_survey_is_added_in_parts_without_what_is_there(
+    run: Run, demo: Demo, halves: Path, tmp_path: Path
+) -> None:
+    map_ = tmp_path / "m.tpmap"
+    map_.write_bytes((halves / "m.tpmap").read_bytes())
+    names = [image.name for image in read_model(halves / "survey")]
+    asked = ["align", map_, halves / "survey", "--images", demo.folder / "survey", "--apply"]
+    for part, num_added in ((names[:12], 12), (names[:15], 3)):
+        (tmp_path / "part.txt").write_text("\n".join(part))
+        code, out, _ = run(*asked, "--list", tmp_path / "part.txt", "--skip-existing")
+        assert code == 0
+        assert out.endswith(f"{map_}: {num_added} images of the survey added\n")
+    with MapReader.open(map_) as reader:
+        assert reader.names()[70:] == names[:15]
+
+
 def test_poses_that_do_not_fit_together_are_refused(
     run: Run, demo: Demo, halves: Path, tmp_path: Path
 ) -> None:
@@ -107,6 +123,16 @@ def test_poses_that_do_not_fit_together_are_refused(
     assert not (tmp_path / "aligned").exists()
 
 
+def test_why_images_are_lost_is_said(run: Run, demo: Demo, halves: Path, tmp_path: Path) -> None:
+    images = read_model(halves / "survey")[::7]
+    halved = [replace(image, camera=replace(image.camera, width=64)) for image in images]
+    write_model(tmp_path / "survey", halved)
+    asked = ["align", halves / "m.tpmap", tmp_path / "survey", "--images", demo.folder / "survey"]
+    code, _, err = run(*asked, "-o", tmp_path / "aligned")
+    assert code == 1
+    assert "0 of 10 images of the survey were localized in the map (BAD_FRAME: " in err
+
+
 def test_what_is_asked_for_is_checked_before_any_work(
     run: Run, demo: Demo, halves: Path, tmp_path: Path
 ) -> None:
@@ -115,6 +141,8 @@ def test_what_is_asked_for_is_checked_before_any_work(
         ([], "give -o"),
         (["-o", tmp_path / "out", "--date", "2026-04-01"], "give its name with --session"),
         (["-o", halves / "survey"], "holds a COLMAP model already"),
+        (["-o", halves / "m.tpmap"], "is no folder; name a new one"),
+        (["-o", tmp_path / "out", "--pose-topic", "/pose"], "has no use for --pose-topic"),
     ):
         code, _, err = run(*asked, *arguments)
         assert code == 1

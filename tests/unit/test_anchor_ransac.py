@@ -27,7 +27,7 @@ from trigpoint.rigid import (
 
 Array = NDArray[np.float64]
 
-quick = settings(max_examples=25, deadline=None)
+quick = settings(max_examples=25)
 seeds = st.integers(0, 2**32 - 1)
 MAX_ERROR_RAD = float(np.deg2rad(5))
 

@@ -12,7 +12,7 @@ from trigpoint.errors import ConfigError
 
 Array = NDArray[np.float64]
 
-quick = settings(max_examples=40, deadline=None)
+quick = settings(max_examples=40)
 CAMERAS = [
     Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 321.0, 239.0)),
     Camera("PINHOLE", 640, 480, (500.0, 510.0, 321.0, 239.0)),

@@ -20,7 +20,7 @@ from trigpoint.rigid import Rigid3, rotate
 Array = NDArray[np.float64]
 Average = Callable[[Array, Array], Array | None]
 
-quick = settings(max_examples=30, deadline=None)
+quick = settings(max_examples=30)
 seeds = st.integers(0, 2**32 - 1)
 both_averages = pytest.mark.parametrize("average", [average_centers, average_centers_robust])
 

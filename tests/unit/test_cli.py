@@ -7,11 +7,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
+import lmdb
 import pytest
 
 from tests.conftest import Demo
 from tests.unit.conftest import Run
+from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
 from trigpoint.models.features import FeatureModel
 from trigpoint_db.demo import CAMERA
@@ -34,6 +37,10 @@ def place(demo: Demo, tmp_path: Path) -> Path:
 
 def build(place: Path, name: str = "m.tpmap", *more: object) -> list[object]:
     return ["build", place / name, place, *more]
+
+
+def add(place: Path, *more: object) -> list[object]:
+    return ["add", *build(place, "m.tpmap", *more)[1:]]
 
 
 def test_from_images_to_numbers(run: Run, place: Path) -> None:
@@ -81,10 +88,11 @@ def test_images_are_added_to_a_map_once(run: Run, place: Path) -> None:
     (place / "first.txt").write_text("\n".join(names[:5]))
     (place / "rest.txt").write_text("\n".join(names[5:]))
     assert run(*build(place, "m.tpmap", "--list", place / "first.txt"))[0] == 0
-    assert run(*build(place, "m.tpmap", "--list", place / "rest.txt", "--append"))[0] == 0
-    code, _, err = run(*build(place, "m.tpmap", "--append"))
+    assert run(*add(place, "--list", place / "rest.txt"))[0] == 0
+    code, _, err = run(*add(place))
     assert code == 1
     assert "already" in err
+    assert run(*add(place, "--skip-existing"))[0] == 0
     _, out, _ = run("info", place / "m.tpmap", "--json")
     assert json.loads(out)["num_images"] == 12
 
@@ -157,15 +165,22 @@ def test_what_a_killed_command_left_is_removed_by_the_next(run: Run, place: Path
     assert of_another.exists()
 
 
+@pytest.mark.parametrize("at", ["the file", "LMDB's pages", "the first commit"])
 def test_a_build_killed_before_its_first_image_is_begun_anew(
-    run: Run, place: Path, model: FeatureModel
+    run: Run, place: Path, model: FeatureModel, at: str
 ) -> None:
-    MapWriter.create(place / "m.tpmap.partial", model.identity).close()
+    partial = place / "m.tpmap.partial"
+    if at == "the file":
+        partial.touch()
+    elif at == "LMDB's pages":
+        lmdb.open(str(partial), subdir=False).close()
+    else:
+        MapWriter.create(partial, model.identity).close()
     assert run(*build(place))[0] == 0
     assert not list(place.glob("m.tpmap.*"))
 
 
-def test_sigterm_leaves_nothing_half_built(place: Path) -> None:
+def test_sigterm_leaves_nothing_half_built(run: Run, place: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "trigpoint_db.cli", *map(str, build(place))],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -174,7 +189,19 @@ def test_sigterm_leaves_nothing_half_built(place: Path) -> None:
         time.sleep(0.01)
     process.terminate()
     process.wait(20)
+    assert not (place / "m.tpmap").exists()
+    assert run(*build(place))[0] == 0  # without --resume
     assert not list(place.glob("m.tpmap.*"))
+
+
+def test_no_map_is_made_of_what_is_all_left_out(run: Run, place: Path) -> None:
+    (place / "one.txt").write_text("000000.jpg\n")
+    code, _, err = run(*build(place, "m.tpmap", "--list", place / "one.txt", "--select"))
+    assert code == 1
+    assert "would leave out all 1 images" in err
+    assert not (place / "m.tpmap").exists()
+    resumed = build(place, "m.tpmap", "--list", place / "one.txt", "--resume")
+    assert run(*resumed)[0] == 0
 
 
 def test_an_empty_list_makes_no_map(run: Run, place: Path) -> None:
@@ -236,11 +263,7 @@ def test_a_compact_map_is_built_and_added_to(run: Run, place: Path) -> None:
         (place / path).write_text("\n".join(part))
     first = build(place, "m.tpmap", "--list", place / "first.txt", "--profile", "compact")
     assert run(*first)[0] == 0
-    more = build(place, "m.tpmap", "--list", place / "others.txt", "--append")
-    code, _, err = run(*more, "--profile", "standard")
-    assert code == 1
-    assert "is of the compact profile" in err
-    assert run(*more)[0] == 0
+    assert run(*add(place, "--list", place / "others.txt"))[0] == 0
     facts = json.loads(run("info", place / "m.tpmap", "--json")[1])
     assert (facts["profile"], facts["num_images"]) == ("compact", 12)
     assert facts["bytes"] < 12 * 30_000
@@ -269,3 +292,66 @@ def test_queries_are_localized_around_prior_positions(run: Run, place: Path) -> 
     code, _, err = run(*arguments, "--priors", place / "priors.txt")
     assert code == 1
     assert "names none of the images" in err
+
+
+def test_resume_does_what_is_left_after_the_mapping(
+    run: Run, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    asked = build(place, "m.tpmap", "--select", "--density", "10%", "--json")
+    code, out, _ = run(*asked)
+    assert code == 0
+    whole = json.loads(out)
+    assert 2 <= whole["num_images_added"] < 12
+    (place / "m.tpmap").rename(place / "whole.tpmap")
+    with monkeypatch.context() as stopped:
+        stopped.setattr("trigpoint_db.commands.build.calibrate_map", interrupt)
+        code, _, err = run(*asked)
+        assert code == 130
+        assert "goes on with --resume" in err
+    assert not (place / "m.tpmap").exists()
+    code, out, _ = run(*asked, "--resume")
+    assert code == 0
+    assert json.loads(out)["num_images_added"] == whole["num_images_added"]
+    with MapReader.open(place / "m.tpmap") as a, MapReader.open(place / "whole.tpmap") as b:
+        assert (a.names(), a.pose_noise) == (b.names(), b.pose_noise)
+    assert not list(place.glob("m.tpmap.*"))
+
+
+def test_add_says_how_it_goes_on(run: Run, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    (place / "first.txt").write_text("000000.jpg\n000005.jpg\n")
+    assert run(*build(place, "m.tpmap", "--list", place / "first.txt"))[0] == 0
+    monkeypatch.setattr("trigpoint_db.commands.build.calibrate_map", interrupt)
+    code, _, err = run(*add(place, "--skip-existing", "--select"))
+    assert code == 130
+    assert "goes on with --skip-existing; `trigpoint-db select` finds what it should" in err
+    with MapReader.open(place / "m.tpmap") as reader:
+        assert reader.verify() == []
+
+
+def test_what_cannot_be_written_is_said_before_the_work(
+    run: Run, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = SimpleNamespace(access=lambda *_: False, W_OK=os.W_OK)  # as for who is not root
+    monkeypatch.setattr("trigpoint.output.os", nothing)
+    asked = ["localize", "no.tpmap", "--images", place, "--queries", "no.txt", "--poses"]
+    code, _, err = run(*asked, place / "p.txt")
+    assert (code, "p.txt: permission denied" in err) == (1, True)
+
+
+def test_one_file_is_not_written_twice_and_no_input_is(run: Run, place: Path) -> None:
+    assert run(*build(place))[0] == 0
+    priors = place / "priors.txt"
+    priors.write_text("000000.jpg 0 0 0 1\n")
+    asked = ["localize", place / "m.tpmap", "--images", place / "images"]
+    asked += ["--queries", place / "queries.txt", "--priors", priors, "--poses"]
+    code, _, err = run(*asked, place / "p.txt", "--results", place / "p.txt")
+    assert (code, "it is named twice" in err) == (1, True)
+    code, _, err = run(*asked, priors)
+    assert (code, "it is an input" in err) == (1, True)
+    assert priors.read_text() == "000000.jpg 0 0 0 1\n"

@@ -1,6 +1,7 @@
 """The commands on maps in use: what they print, and what they say of bad input."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -53,6 +54,8 @@ def test_images_are_removed_by_name_by_list_and_by_session(run: Run, map_: Path)
     assert code == 0
     assert json.loads(out)["num_images_removed"] == 4
     assert names(map_) == ["folder/0.png", "folder/3.png"]
+    listed.write_text("")  # what `usage --unused` has found: nothing
+    assert run("remove", map_, "--names", listed)[:2] == (0, f"{map_}: 0 images removed\n")
     for arguments, said in (
         ([], "there is nothing to remove"),
         (["folder/0.png", "folder/7.png"], "holds no image 'folder/7.png'"),
@@ -173,7 +176,9 @@ def test_images_without_use_go_from_the_map_by_their_list(
     run: Run, map_: Path, tmp_path: Path
 ) -> None:
     log = write_log(tmp_path / "log.mcap", *[status("LOCALIZED", _0=7, _1=0)] * 10)
-    code, out, _ = run("usage", map_, log, "--unused")
+    cut = tmp_path / "cut.mcap"  # as a crash leaves it at its start
+    cut.write_bytes(log.read_bytes()[:60])
+    code, out, _ = run("usage", map_, log, cut, log, "--unused", "--min-frames", 10)
     assert (code, out) == (0, "folder/1.png\n")
     (tmp_path / "unused.txt").write_text(out)
     assert run("remove", map_, "--names", tmp_path / "unused.txt")[0] == 0
@@ -215,3 +220,13 @@ def test_the_log_of_a_flight_says_which_images_were_of_use(
     supported = [of["num_supported"] for of in found["images"]]
     assert 2 * num_localized <= sum(supported) <= 8 * num_localized  # the last refinement's
     assert sum(of["num_retrieved"] for of in found["images"]) >= 6 * 16
+
+
+def test_names_are_shown_as_they_are(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "a.tpmap"
+    with MapWriter.create(path, replace(MODEL, name="own[/a] [b]")) as writer:
+        add(writer, 0, session=Session("floor[/2] [a]"))
+    code, out, _ = run("info", path)
+    assert code == 0
+    assert "of session floor[/2] [a]" in out
+    assert "own[/a] [b] (000000000000)" in out

@@ -95,7 +95,7 @@ def test_the_map_of_a_cluster_with_a_worker_killed_is_that_of_one_process(
 
 
 def test_addresses_without_a_scheduler_or_workers(scheduler: str, port: int) -> None:
-    for address in (f"tcp://127.0.0.1:{port}", "nonsense://1"):
+    for address in (f"tcp://127.0.0.1:{port}", "nonsense://1", "foo"):
         with pytest.raises(ConfigError, match=f"no Dask scheduler answers at {address}"):
             Cluster(address, patience_s=0.5)
     with pytest.raises(ConfigError, match=f"the scheduler at {scheduler} has no workers"):

@@ -17,7 +17,7 @@ from trigpoint.rigid import Rigid3, rotation_from_vector
 from trigpoint_db.importers.base import PosedImage
 from trigpoint_db.importers.colmap import read_model, write_model
 
-quick = settings(max_examples=25, deadline=None)
+quick = settings(max_examples=25)
 
 CAMERAS_TEXT = """\
 # Camera list with one line of data per camera:

@@ -1,6 +1,7 @@
 """Where a map is strong and where not, what lies between its images, and what to photograph."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,14 +23,13 @@ from trigpoint_db.coverage import (
     Coverage,
     Grade,
     Probe,
-    count_cells,
-    headings,
     horizontal_axes,
     mean_up,
     measure_coverage,
     view_distance,
 )
 from trigpoint_db.gaps import find_gaps, neighbor_pairs, suggest_poses
+from trigpoint_db.ground import count_cells, headings
 from trigpoint_db.poses import read_poses
 from trigpoint_db.synthetic import look_along, look_at
 
@@ -134,6 +134,20 @@ def test_gaps_are_found_between_images_and_graded_by_how_far_these_reach(tmp_pat
     np.testing.assert_allclose(np.linalg.norm(centers, axis=1), 2.0)  # around what they look at
 
 
+def test_images_that_were_not_compared_leave_no_gap_where_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    degrees = np.array([0.0, 45, 15, 60, 30])  # of those compared the first two are neighbours
+    monkeypatch.setattr("trigpoint_db.gaps.MAX_COMPARED", 3)
+    with MapReader.open(make_map(tmp_path / "m.tpmap", 5)) as reader:
+        coverage = make_coverage(ring(degrees), [Grade.STRONG] * 5)
+        assert find_gaps(reader, coverage) == []
+        between = "between folder/0.png and folder/1.png"
+        degrees[[2, 4]] = 75
+        coverage = make_coverage(ring(degrees), [Grade.STRONG] * 5)
+        assert {gap.reason.split(",")[0] for gap in find_gaps(reader, coverage)} == {between}
+
+
 def test_the_way_between_cameras_that_look_apart_is_straight(tmp_path: Path) -> None:
     poses = look_along([[0.0, 0, 0], [0.0, 1.5, 0]], [-0.3, 0.3], 0.0, 0.0)
     with MapReader.open(make_map(tmp_path / "m.tpmap", 2)) as reader:
@@ -224,7 +238,9 @@ def test_images_that_nothing_supports_are_blind_and_others_strong(
     np.testing.assert_allclose(coverage.up, [0, 0, 1], atol=0.1)
 
 
-def test_coverage_prints_draws_and_lists_poses(run: Run, weak_map: Path, tmp_path: Path) -> None:
+def test_coverage_prints_draws_and_lists_poses(
+    run: Run, weak_map: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     picture, poses = tmp_path / "coverage.png", tmp_path / "poses.txt"
     asked = ["coverage", weak_map, "--probes", 2, "-o", picture, "--photograph", poses]
     code, said, _ = run(*asked, "--json")
@@ -237,8 +253,13 @@ def test_coverage_prints_draws_and_lists_poses(run: Run, weak_map: Path, tmp_pat
     assert len(named) == len(facts["photograph"]) > 0
     first = facts["photograph"][0]
     np.testing.assert_allclose(named["photograph_000"].center, first["center"])
-    code, said, _ = run("coverage", weak_map, "--probes", 1)
+    (tmp_path / "a[").mkdir()
+    bracketed = tmp_path / "a[" / "b].tpmap"
+    bracketed.write_bytes(weak_map.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    code, said, _ = run("coverage", bracketed.relative_to(tmp_path), "--probes", 1)
     assert code == 0
+    assert "a[/b].tpmap: 1 of" in said
     assert "photograph (" in said
 
 
@@ -247,8 +268,21 @@ def test_a_direction_up_that_is_none_and_a_small_map_are_errors(
 ) -> None:
     code, _, said = run("coverage", weak_map, "--up", "0,0")
     assert (code, "--up wants a direction" in said) == (1, True)
+    code, _, said = run("coverage", weak_map, "--cell", "inf")
+    assert (code, "--cell wants a length, not inf" in said) == (1, True)
     code, _, said = run("coverage", weak_map, "-o", tmp_path / "x.txt")
     assert (code, "cannot draw" in said) == (1, True)
+    both = tmp_path / "x.png"
+    code, _, said = run("coverage", weak_map, "-o", both, "--photograph", both)
+    assert (code, "it is named twice" in said) == (1, True)
     MapWriter.create(tmp_path / "empty.tpmap", model.identity).close()
     code, _, said = run("coverage", tmp_path / "empty.tpmap")
     assert (code, "three at least" in said) == (1, True)
+
+
+def test_without_matplotlib_a_picture_is_refused_before_the_work(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    code, _, said = run("coverage", tmp_path / "missing.tpmap", "-o", tmp_path / "x.png")
+    assert (code, "pip install 'trigpoint[plots]'" in said) == (1, True)

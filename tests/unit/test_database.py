@@ -24,7 +24,7 @@ from trigpoint.frame import LocalFeatures, restore_descriptors
 from trigpoint.rigid import Rigid3
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32 - 1),
     num_keypoints=st.integers(0, 200),
@@ -61,7 +61,7 @@ def test_an_image_comes_back_within_its_quantisation(
     assert (error <= 2 / 127 * 1.01).all()
 
 
-@pytest.mark.parametrize("model", [model for model in PARAMETERS if model != "FULL_OPENCV"])
+@pytest.mark.parametrize("model", PARAMETERS)
 def test_every_camera_model_comes_back_exactly(tmp_path: Path, model: str) -> None:
     params = tuple(0.1 + 7 * i / 3 for i in range(len(PARAMETERS[model])))
     camera = Camera(model, 640, 480, params)
@@ -69,15 +69,6 @@ def test_every_camera_model_comes_back_exactly(tmp_path: Path, model: str) -> No
         add(writer, 0, camera=camera)
     with MapReader.open(tmp_path / "a.tpmap") as reader:
         assert reader.anchor(0).camera == camera
-
-
-def test_a_camera_with_more_parameters_than_a_map_holds_is_an_error(tmp_path: Path) -> None:
-    camera = Camera("FULL_OPENCV", 640, 480, (500.0, 500.0, 320.0, 240.0, *[0.1] * 8))
-    with (
-        MapWriter.create(tmp_path / "a.tpmap", MODEL) as writer,
-        pytest.raises(DatabaseError, match="FULL_OPENCV camera, which a map cannot hold"),
-    ):
-        add(writer, 0, camera=camera)
 
 
 def test_an_image_of_1024_keypoints_takes_less_than_72_kilobytes(tmp_path: Path) -> None:
@@ -140,6 +131,7 @@ def changed(**arrays: NDArray[np.float32]) -> LocalFeatures:
         ({"name": "ä" * 251}, "has 502 bytes"),
         ({"name": "\udcff"}, "not valid Unicode"),
         ({"cam_from_world": Rigid3(np.eye(3), np.array([0, np.nan, 0]))}, "not finite"),
+        ({"cam_from_world": Rigid3(np.eye(3), np.array([0, 1e300, 0]))}, r"beyond 1e\+09 units"),
         ({"cam_from_world": Rigid3(-np.eye(3), np.zeros(3))}, "is no rotation"),
         ({"cam_from_world": Rigid3.stack([make_pose(0)])}, "is a batch"),
         ({"features": make_features(9, model=replace(MODEL, descriptor_dim=8))}, "descriptors"),
@@ -164,7 +156,7 @@ def test_what_cannot_be_added_is_refused_and_leaves_no_trace(
         assert (reader.names(), reader.verify()) == (["folder/0.png", "folder/1.png"], [])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), k=st.integers(0, 320))
 def test_search_equals_brute_force_on_the_stored_rows(
     tmp_path_factory: pytest.TempPathFactory, seed: int, k: int
@@ -206,7 +198,7 @@ def test_a_diverse_search_passes_over_what_looks_like_a_better_image(tmp_path: P
     assert similarities[1] < similarities[2]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(k=st.integers(1, 40), diversity=st.floats(0.01, 1), seed=st.integers(0, 99))
 def test_a_diverse_search_is_the_greedy_choice(
     tmp_path_factory: pytest.TempPathFactory, k: int, diversity: float, seed: int
@@ -237,6 +229,16 @@ def test_equally_similar_images_come_in_the_order_they_were_added(tmp_path: Path
             found, similarities = reader.search(make_features(0).global_descriptor, k)
             assert found[:94].tolist() == [*range(0, 280, 3)][:k]
             assert np.lexsort((found, -similarities)).tolist() == [*range(k)]
+
+
+def test_the_poses_of_all_images_come_by_index(tmp_path: Path) -> None:
+    for num_images in (0, 3):
+        with MapReader.open(make_map(tmp_path / f"{num_images}.tpmap", num_images)) as reader:
+            poses = reader.poses()
+            assert (poses.R.shape, poses.center.shape) == ((num_images, 3, 3), (num_images, 3))
+            for index in range(num_images):
+                np.testing.assert_array_equal(poses[index].R, reader.view(index)[1].R)
+                np.testing.assert_array_equal(poses[index].t, reader.view(index)[1].t)
 
 
 def test_searching_for_another_networks_descriptor_is_an_error(tmp_path: Path) -> None:

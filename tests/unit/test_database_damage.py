@@ -1,6 +1,7 @@
 """Files that are no maps, or no longer. Run as a program, this file reads damaged maps."""
 
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -46,12 +47,14 @@ def alter_entry(path: Path, key: bytes, payload: bytes | None) -> None:
 
 
 def alter_byte(path: Path, found_by: bytes) -> None:
-    """Flip one bit of the last place where these bytes lie in the file."""
+    """Flip one bit of each place where these bytes lie in the file: some are of no use any more."""
     octets = path.read_bytes()
-    place = octets.rindex(found_by)
+    places = [match.start() for match in re.finditer(re.escape(found_by), octets)]
+    assert places
     with path.open("r+b") as file:  # in place, under readers that have it open
-        file.seek(place)
-        file.write(bytes([octets[place] ^ 1]))
+        for place in places:
+            file.seek(place)
+            file.write(bytes([octets[place] ^ 1]))
 
 
 def stored_keypoints(index: int) -> bytes:
@@ -108,7 +111,7 @@ def test_a_map_of_another_model_is_refused_and_both_are_named(tmp_path: Path) ->
 def test_a_map_of_another_format_is_refused(tmp_path: Path) -> None:
     path = make_map(tmp_path / "a.tpmap", 1)
     alter_entry(path, schema.METADATA_KEY, b'{"format": 9, "shards": []}')
-    with pytest.raises(DatabaseError, match="a map of format 9, and this version reads format 4"):
+    with pytest.raises(DatabaseError, match="a map of format 9, and this version reads format 5"):
         MapReader.open(path)
 
 
@@ -138,7 +141,7 @@ def test_a_flipped_bit_is_found_where_it_lies_and_nowhere_else(tmp_path: Path) -
         for _ in range(2):
             with pytest.raises(DatabaseError, match=r"image 7 is damaged: its checksum.*restore"):
                 reader.anchor(7)
-        assert reader.verify() == ["image 7 is damaged: its checksum does not match"]
+        assert reader.verify() == ["image 7 is damaged: its checksum does not match (folder/7.png)"]
         require_image(reader, 8)
 
 
@@ -159,7 +162,7 @@ def test_damage_after_a_record_was_read_is_found_by_verify(tmp_path: Path) -> No
         require_image(reader, 1)
         assert reader.verify() == []
         alter_byte(path, stored_keypoints(1))
-        assert reader.verify() == ["image 1 is damaged: its checksum does not match"]
+        assert reader.verify() == ["image 1 is damaged: its checksum does not match (folder/1.png)"]
 
 
 def row(session: int = 0) -> Row:
@@ -175,7 +178,7 @@ def row(session: int = 0) -> Row:
             schema.encode_index(2),
             "the name 'folder/1.png' does not lead to image 1",
         ),
-        (schema.features_key(2), None, "image 2 is missing"),
+        (schema.features_key(2), None, "image 2 is missing (folder/2.png)"),
         (schema.block_key(0), None, "retrieval block 0 is missing"),
         (
             schema.block_key(0),

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -222,3 +223,14 @@ def say(what: object) -> None:
 
 if __name__ == "__main__":
     main(sys.argv[1], Path(sys.argv[2]))
+
+
+def test_threads_open_and_close_one_map(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 3)
+
+    def look(_: int) -> int:
+        with MapReader.open(path) as reader:
+            return len(reader)
+
+    with ThreadPoolExecutor(6) as threads:  # one opens it as another closes it
+        assert set(threads.map(look, range(3000))) == {3}

@@ -24,7 +24,7 @@ def require_images(path: Path, expected: set[int]) -> None:
             assert found == index
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     steps=st.lists(
         st.tuples(st.sampled_from(["add", "remove", "commit", "reopen"]), st.integers(0, 11)),

@@ -71,7 +71,7 @@ def test_an_image_that_takes_the_place_of_a_removed_one_keeps_its_session(tmp_pa
     assert found == {f"folder/{i}.png": session_of(i) for i in set(range(300)) - gone}
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 999),
     k=st.integers(1, 60),

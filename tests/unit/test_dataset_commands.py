@@ -57,6 +57,15 @@ def test_queries_are_chosen_by_their_names(run: Run, town_copy: Path, tmp_path: 
         assert said in err
 
 
+def test_what_is_of_the_data_set_is_not_written_over(run: Run, town_copy: Path) -> None:
+    taken = next(path for path in town_copy.rglob("*") if path.is_file())
+    before = taken.read_bytes()
+    code, _, err = run("queries", town_copy, taken)
+    assert code == 1
+    assert "may be a file of the data set" in err
+    assert taken.read_bytes() == before
+
+
 @pytest.mark.parametrize(
     ("benchmark", "names", "submitted"),
     [

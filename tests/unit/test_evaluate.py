@@ -15,11 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from tests.unit.conftest import Run
 from trigpoint.errors import ConfigError
 from trigpoint.rigid import Rigid3, rotation_from_vector
 from trigpoint_db.evaluate import Evaluation, evaluate, plot_paths
+from trigpoint_db.poses import write_poses
 
-quick = settings(max_examples=40, deadline=None)
+quick = settings(max_examples=40)
 draws = pytest.mark.skipif(find_spec("matplotlib") is None, reason="needs trigpoint[plots]")
 
 
@@ -189,15 +191,30 @@ def test_the_path_follows_the_times_that_are_its_names(tmp_path: Path) -> None:
 
 @draws
 def test_a_picture_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"cannot write .*paths\.png: No such file"):
+    with pytest.raises(ConfigError, match=r"cannot write .*paths\.png: there is no folder"):
         plot_paths({}, circle(3), tmp_path / "missing" / "paths.png")
     with pytest.raises(ConfigError, match=r"cannot draw .*paths\.xyz; name it .png"):
         plot_paths({}, circle(3), tmp_path / "paths.xyz")
 
 
 def test_without_matplotlib_the_error_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ConfigError, match=r"pip install 'trigpoint\[plots\]'"):
         plot_paths({}, circle(3), tmp_path / "paths.png")
+    write_poses(tmp_path / "poses.txt", circle(3))
+    asked = ["--poses", tmp_path / "poses.txt", "--truth", tmp_path / "poses.txt"]
+    code, out, said = run("evaluate", *asked, "--picture", tmp_path / "paths.png")
+    assert (code, out) == (1, "")  # before anything is compared
+    assert "pip install 'trigpoint[plots]'" in said
+
+
+@draws
+def test_the_picture_is_named_as_it_is(run: Run, tmp_path: Path) -> None:
+    write_poses(tmp_path / "poses.txt", circle(3))
+    asked = ["--poses", tmp_path / "poses.txt", "--truth", tmp_path / "poses.txt"]
+    (tmp_path / "a[").mkdir()
+    code, out, _ = run("evaluate", *asked, "--picture", tmp_path / "a[" / "b].png")
+    assert code == 0
+    assert f"picture: {tmp_path}/a[/b].png" in out

@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import os
 import re
+import select
 import subprocess
 import sys
 import threading
@@ -16,16 +18,19 @@ from tests.unit.conftest import Run
 from tests.unit.flaky_publisher import NUM_CHUNKS
 from tests.unit.maps import MODEL, add, make_features, require_image
 from trigpoint.database.reader import MapReader
+from trigpoint.database.snapshot import MAX_MAP_BYTES
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import ConfigError, SourceError
 from trigpoint_db.fleet.fetch import fetch_map
 from trigpoint_db.fleet.manifest import CHUNK_BYTES, Manifest
+from trigpoint_db.fleet.offer import Offer
 from trigpoint_db.fleet.zenoh import Publisher, RemoteMap, check_key, open_session
 
 KEY = "trigpoint/maps/office"
 UNIT = Path(__file__).parents[2] / "systemd" / "trigpoint-fetch@.service"
 NUM_IMAGES = 500
 TIMEOUT_S = 60
+STOP_S = 10  # of the unit
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +91,15 @@ def publishing(path: Path, endpoint: str) -> Iterator[Publisher]:
 
 
 @contextlib.contextmanager
+def reaching(endpoint: str, kind: type[RemoteMap] = RemoteMap) -> Iterator[RemoteMap]:
+    session = open_session(None, [endpoint], None)
+    try:
+        yield kind(session, KEY)
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+
+
+@contextlib.contextmanager
 def process(*arguments: object) -> Iterator[subprocess.Popen[str]]:
     """Run a module; it is gone at the end."""
     started = subprocess.Popen(
@@ -118,6 +132,12 @@ def num_fetched(out: Path) -> int:
     return sum(any(data[i : i + CHUNK_BYTES]) for i in range(0, len(data), CHUNK_BYTES))
 
 
+def num_bytes_read() -> int:
+    """Count what this process has read from files."""
+    counts = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
+    return int(counts["rchar"])
+
+
 def test_a_map_arrives_and_a_commit_costs_what_it_has_changed(
     office: Path, out: Path, endpoint: str, run: Run
 ) -> None:
@@ -140,6 +160,29 @@ def test_a_map_arrives_and_a_commit_costs_what_it_has_changed(
         assert "up to date" in text
     assert {path.name for path in out.parent.iterdir()} <= {out.name, out.name + "-lock"}
     assert {path.name for path in office.parent.iterdir()} <= {office.name, office.name + "-lock"}
+
+
+def test_a_map_that_is_up_to_date_is_read_once_until_it_changes(
+    office: Path, out: Path, endpoint: str
+) -> None:
+    with publishing(office, endpoint), reaching(endpoint) as remote:
+        fetch_map(remote, out, patience_s=TIMEOUT_S, track=untracked)
+        good = out.read_bytes()
+        num_read = []
+        for _ in range(2):
+            before = num_bytes_read()
+            fetched = fetch_map(remote, out, patience_s=TIMEOUT_S, track=untracked)
+            assert not fetched.is_new
+            num_read.append(num_bytes_read() - before)
+        assert num_read[0] >= len(good) > CHUNK_BYTES > num_read[1]
+        status = out.stat()
+        with out.open("r+b") as file:  # of the same size
+            file.write(bytes(16))
+        os.utime(out, ns=(status.st_atime_ns, status.st_mtime_ns))
+        fetched = fetch_map(remote, out, patience_s=TIMEOUT_S, track=untracked)
+    assert fetched.is_new
+    assert 0 < fetched.num_bytes_fetched <= CHUNK_BYTES
+    assert out.read_bytes() == good
 
 
 def test_a_publisher_killed_in_the_middle_and_started_again(
@@ -178,6 +221,45 @@ def test_a_fetch_killed_in_the_middle_goes_on(
     assert generation_of(out) == generation_of(office)
 
 
+def test_a_stop_does_not_wait_for_a_publisher_that_stalls(
+    office: Path, out: Path, endpoint: str
+) -> None:
+    with (
+        flaky(office, endpoint, "stalls"),
+        process("trigpoint_db.cli", *fetching(out, endpoint, "--watch")) as fetch,
+    ):
+        wait_until(lambda: num_fetched(out) >= NUM_CHUNKS)
+        fetch.terminate()
+        assert fetch.wait(STOP_S) == 130
+    assert num_fetched(out) == NUM_CHUNKS
+
+
+def test_a_publisher_that_stalls_is_waited_for_no_longer_than_asked(
+    office: Path, out: Path, endpoint: str
+) -> None:
+    with (
+        flaky(office, endpoint, "stalls"),
+        process("trigpoint_db.cli", *fetching(out, endpoint, "--timeout", 3)) as fetch,
+    ):
+        _, err = fetch.communicate(timeout=TIMEOUT_S / 2)
+    assert fetch.returncode == 1
+    assert f"nothing came on {KEY} for 3 s" in err
+    assert num_fetched(out) == NUM_CHUNKS
+
+
+def test_silence_is_not_taken_for_a_refusal(
+    office: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with flaky(office, endpoint, "stalls"), reaching(endpoint) as remote:
+        wait_until(lambda: remote.get_manifest(TIMEOUT_S) is not None)
+        manifest = remote.get_manifest(TIMEOUT_S)
+        assert manifest is not None
+        *answered, silent = manifest.chunks[: NUM_CHUNKS + 1]
+        assert [len(remote.get_chunk(chunk)) for chunk in answered] == [1] * NUM_CHUNKS
+        monkeypatch.setattr("trigpoint_db.fleet.zenoh._REPLY_TIMEOUT_S", 0.1)
+        assert remote.get_chunk(silent) == []
+
+
 def test_a_chunk_that_is_not_what_the_manifest_says_is_not_taken(
     office: Path, out: Path, endpoint: str, run: Run
 ) -> None:
@@ -190,24 +272,75 @@ def test_a_chunk_that_is_not_what_the_manifest_says_is_not_taken(
     assert out.read_bytes() == b"the old one"
 
 
+def test_a_publisher_that_lacks_what_it_announces_is_not_asked_for_ever(
+    office: Path, out: Path, endpoint: str
+) -> None:
+    with (
+        flaky(office, endpoint, "lacks"),
+        process("trigpoint_db.cli", *fetching(out, endpoint)) as fetch,
+    ):
+        _, err = fetch.communicate(timeout=TIMEOUT_S / 2)
+    assert fetch.returncode == 1
+    assert f"what is announced on {KEY} is not to be had there, 3 times" in err
+    assert not out.exists()
+
+
 def test_a_map_that_changes_while_it_is_fetched(office: Path, out: Path, endpoint: str) -> None:
+    sizes: list[int] = []
     with publishing(office, endpoint) as publisher:
-        change = threading.Lock()
+        last = publisher.manifest.chunks[-1]
 
         class Watched(RemoteMap):
             def get_chunk(self, sha256: str) -> list[bytes | None]:
-                with change:
-                    if publisher.manifest.num_images == NUM_IMAGES:
-                        extend(office)
-                        assert publisher.refresh()
-                return super().get_chunk(sha256)
+                if sha256 == last and publisher.manifest.num_images == NUM_IMAGES:
+                    extend(office)
+                    assert publisher.refresh()
+                answers = super().get_chunk(sha256)
+                sizes.extend(len(answer) for answer in answers if answer is not None)
+                return answers
 
-        session = open_session(None, [endpoint], None)
-        remote = Watched(session, KEY)
-        fetched = fetch_map(remote, out, patience_s=TIMEOUT_S, track=untracked)
-        session.close()  # type: ignore[no-untyped-call]
+        with reaching(endpoint, Watched) as remote:
+            fetched = fetch_map(remote, out, patience_s=TIMEOUT_S, track=untracked)
     assert fetched.manifest.num_images == NUM_IMAGES + 1
+    assert fetched.num_bytes_fetched == sum(sizes) > office.stat().st_size / 2
     assert generation_of(out) == generation_of(office)
+
+
+def test_what_could_not_be_published_is_tried_again(
+    office: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_room(*_: object) -> Offer:
+        raise ConfigError("no room")
+
+    with publishing(office, endpoint) as publisher:
+        before = publisher.manifest.generation
+        extend(office)
+        with monkeypatch.context() as full:
+            full.setattr("trigpoint_db.fleet.zenoh.Offer", no_room)
+            with pytest.raises(ConfigError, match="no room"):
+                publisher.refresh()
+        assert publisher.manifest.generation == before
+        assert publisher.refresh()
+        assert publisher.manifest.generation == generation_of(office)
+        assert not publisher.refresh()
+
+
+def test_what_keeps_a_publisher_from_the_newest_commit_goes_to_standard_error(
+    office: Path, endpoint: str
+) -> None:
+    with process(
+        "trigpoint_db.cli", "publish", office, "--key", KEY, "--listen", endpoint
+    ) as publish:
+        assert publish.stdout is not None
+        assert publish.stderr is not None
+        assert "office.tpmap: generation" in publish.stdout.readline()
+        damaged = office.with_name("damaged")
+        damaged.write_bytes(b"no map")
+        damaged.replace(office)
+        readable, _, _ = select.select([publish.stdout, publish.stderr], [], [], TIMEOUT_S)
+        assert readable == [publish.stderr]
+        said = publish.stderr.readline()
+    assert said.endswith("; the last good state stays published\n")
 
 
 def test_two_fetch_while_a_writer_writes(office: Path, out: Path, endpoint: str) -> None:
@@ -305,9 +438,9 @@ def test_a_full_disk_keeps_the_old_map(office: Path, tmp_path: Path, endpoint: s
 
 
 def test_nobody_publishes(out: Path, endpoint: str, run: Run) -> None:
-    code, _, err = run(*fetching(out, endpoint, "--timeout", 0))
+    code, _, err = run(*fetching(out, endpoint, "--timeout", 1))
     assert code == 1
-    assert f"nothing came on {KEY} for 0 s" in err
+    assert f"nothing came on {KEY} for 1 s" in err
     assert list(out.parent.iterdir()) == []
 
 
@@ -315,6 +448,13 @@ def test_nobody_publishes(out: Path, endpoint: str, run: Run) -> None:
 def test_keys_that_cannot_be_used(key: str) -> None:
     with pytest.raises(ConfigError, match="key"):
         check_key(key)
+
+
+def test_a_key_is_looked_at_before_an_endpoint(office: Path, out: Path, run: Run) -> None:
+    for command in (["publish", office, "--key", "a//b"], ["fetch", "a//b", "-o", out]):
+        code, _, err = run(*command, "--listen", "nonsense")
+        assert code == 1
+        assert err.startswith("trigpoint-db: 'a//b' is no key")
 
 
 @pytest.mark.parametrize("listen", ["nonsense", "tcp/256.0.0.1:1"])
@@ -329,7 +469,7 @@ def test_endpoints_that_cannot_be_used(listen: str, office: Path, run: Run) -> N
     ("change", "said"),
     [
         ({"num_bytes": 0}, "num_bytes"),
-        ({"num_bytes": 2**50}, "num_bytes"),
+        ({"num_bytes": MAX_MAP_BYTES + 1}, "num_bytes"),
         ({"chunks": []}, "0 chunks"),
         ({"sha256": "f" * 63}, "sha256"),
         ({"chunk_bytes": 1}, "chunk_bytes"),

@@ -169,3 +169,11 @@ def test_a_matrix_that_mirrors_or_scales_is_refused(at: tuple[int, int]) -> None
 def test_the_size_of_an_image_is_read_from_its_head(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(PNG)
     assert read_image_size(tmp_path / "a.png") == (480, 270)
+
+
+def test_a_number_beyond_any_measure_is_one_line(tmp_path: Path) -> None:
+    cambridge(tmp_path)
+    (tmp_path / "reconstruction.nvm").write_text("NVM_V3\n\n" + "9" * 23 + "\n")
+    with pytest.raises(ConfigError, match="is damaged, or not of the format cambridge") as caught:
+        read_dataset(tmp_path)
+    assert "\n" not in str(caught.value)

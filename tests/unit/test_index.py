@@ -106,7 +106,7 @@ def test_an_index_finds_what_a_scan_does(indexed: Path) -> None:
         assert recall(reader, list(range(NUM_IMAGES))) > 0.95
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_an_index_of_which_all_is_looked_at_finds_exactly_what_a_scan_does(
     tmp_path_factory: pytest.TempPathFactory, seed: int

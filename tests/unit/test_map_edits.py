@@ -1,7 +1,7 @@
 """Maps merged, split, compacted and compared, while readers have them open."""
 
 import os
-from contextlib import suppress
+from contextlib import closing, suppress
 from datetime import date
 from pathlib import Path
 
@@ -12,9 +12,9 @@ from tests.unit.maps import MODEL, add, make_features, make_map, make_pose, requ
 from tests.unit.test_database_processes import other_process, read_line, tell
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
-from trigpoint.database.replacing import compact_map, new_map
+from trigpoint.database.replacing import compact_map, install_map, new_map
 from trigpoint.database.snapshot import require_in_place
-from trigpoint.database.writer import MapWriter
+from trigpoint.database.writer import MapWriter, keep_writers_out
 from trigpoint.errors import ConfigError, DatabaseError
 from trigpoint.frame import ModelIdentity, PoseNoise, Session
 from trigpoint.rigid import Rigid3
@@ -22,6 +22,7 @@ from trigpoint_db.maps import (
     compare_maps,
     count_sessions,
     find_session,
+    leave_out,
     merge_maps,
     remove_images,
     split_map,
@@ -176,6 +177,40 @@ def test_a_compacted_map_is_smaller_and_the_same_under_a_reader_that_has_it_open
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.tpmap", "a.tpmap-lock"]
 
 
+@pytest.mark.parametrize("num_commits", [1, 2])
+def test_a_copy_of_a_snapshot_can_be_read_and_written(tmp_path: Path, num_commits: int) -> None:
+    path, copy = make_part(tmp_path / "a.tpmap", range(9)), tmp_path / "b.tpmap"
+    for index in range(9, 8 + num_commits):
+        with MapWriter.open(path, MODEL) as writer:
+            add(writer, index)
+    with MapReader.open(path) as reader, copy.open("wb") as file:
+        reader.copy_to(file.fileno())
+        num_images = len(reader)
+    with MapWriter.open(copy, MODEL) as writer:
+        writer.remove("folder/3.png")
+        add(writer, 20)
+    with MapReader.open(copy) as reader:
+        assert (len(reader), reader.verify()) == (num_images, [])
+        require_image(reader, 0)
+
+
+def test_a_map_that_was_replaced_meanwhile_is_not_replaced_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, new = make_part(tmp_path / "a.tpmap", range(10)), make_part(tmp_path / "b", range(20))
+
+    def keep_out_too_late(fd: int) -> None:
+        monkeypatch.undo()
+        compact_map(path)
+        keep_writers_out(fd)
+
+    monkeypatch.setattr("trigpoint.database.replacing.keep_writers_out", keep_out_too_late)
+    with pytest.raises(DatabaseError, match="was replaced while it was being opened"):
+        install_map(new, path)
+    with MapReader.open(path) as reader:
+        assert len(reader) == 10
+
+
 def test_a_link_to_a_map_stays_one_when_the_map_is_compacted(tmp_path: Path) -> None:
     (tmp_path / "maps").mkdir()
     path = make_map(tmp_path / "maps" / "a.tpmap", 3)
@@ -237,6 +272,24 @@ def test_a_writer_that_waited_while_the_map_was_replaced_does_not_write_to_the_o
     with pytest.raises(DatabaseError, match="was replaced while it was being opened"):
         require_in_place(path, fd)
     os.close(fd)
+
+
+def test_what_is_added_just_before_a_map_is_rewritten_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = make_part(tmp_path / "a.tpmap", range(10))
+    open_writer = MapWriter.open
+
+    def open_too_late(path: Path, model: ModelIdentity) -> MapWriter:
+        with closing(open_writer(path, model)) as other:
+            add(other, 10)
+            other.commit()
+        return open_writer(path, model)
+
+    monkeypatch.setattr(MapWriter, "open", open_too_late)
+    assert leave_out(path, ["folder/3.png"]) == 10
+    with MapReader.open(path) as reader:
+        assert reader.names()[-1] == "folder/10.png"
 
 
 def test_a_map_that_fails_half_way_leaves_nothing(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def matchable(seed: int, num: int) -> Matchable:
     return Matchable(points, unit(seed, num), 640, 480)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), n=st.integers(0, 40), m=st.integers(0, 40))
 def test_matches_are_each_others_nearest_neighbours(seed: int, n: int, m: int) -> None:
     query, anchor = unit(seed, n), unit(seed + 1, m)
@@ -61,7 +61,7 @@ def test_a_shuffled_copy_is_matched_wholly() -> None:
     np.testing.assert_allclose(similarities, 1, atol=1e-5)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), n=st.integers(0, 60), m=st.integers(0, 60))
 def test_integers_match_as_the_floats_that_they_stand_for(seed: int, n: int, m: int) -> None:
     query, anchor = matchable(seed, n), matchable(seed + 1, m)

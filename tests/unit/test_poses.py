@@ -23,7 +23,7 @@ from trigpoint_db.poses import (
     write_poses,
 )
 
-quick = settings(max_examples=40, deadline=None)
+quick = settings(max_examples=40)
 poses = st.builds(
     lambda rotvec, t: Rigid3(rotation_from_vector(np.array(rotvec)), np.array(t)),
     st.tuples(*[st.floats(-4, 4)] * 3),
@@ -147,7 +147,7 @@ def test_nothing_but_the_file_is_left_behind(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["poses.txt"]
 
 
-@pytest.mark.parametrize("name", ["", " a", "a\n", "a\rb", "#a", "\ud800"])
+@pytest.mark.parametrize("name", ["", " a", "a\n", "a\rb", "#a", "\ud800", "\ufeffa", "\x1b[2J"])
 def test_a_name_that_would_not_read_back_is_not_written(tmp_path: Path, name: str) -> None:
     with pytest.raises(ConfigError, match=r"cannot stand in .*poses\.txt; rename"):
         write_poses(tmp_path / "poses.txt", {"ok": Rigid3.identity(), name: Rigid3.identity()})
@@ -161,6 +161,7 @@ def test_a_name_that_would_not_read_back_is_not_written(tmp_path: Path, name: st
         ("1 0 0 0 1 2 3", "expected 'name qw"),
         ("b 1 0 0 0 1 2 z", "expected 'name qw"),
         ("b 0 0 0 0 1 2 3", "quaternion 0.0 0.0 0.0 0.0 is not one of a rotation"),
+        ("b OPENCV 640 480 733.6 733.6 319.5 239.5 0 0 0 0", "is not one of a rotation"),
         ("b 1e-300 0 0 0 1 2 3", "is not one of a rotation"),
         ("b nan 0 0 0 1 2 3", "is not finite"),
         ("b 1 0 0 0 1 2 -inf", "is not finite"),
@@ -216,3 +217,16 @@ def test_an_error_in_priors_names_its_line(tmp_path: Path, line: str, message: s
     path = write(tmp_path / "priors.txt", f"b 1 2 3 4\n{line}\n")
     with pytest.raises(ConfigError, match=f"priors.txt:2: .*{message}"):
         read_priors(path)
+
+
+def test_names_are_kept_as_cameras_and_screens_give_them(tmp_path: Path) -> None:
+    names = ["Screenshot 10.20.30\u202fAM.png", "a\u200db.jpg", "a\u2028b.jpg"]
+    poses = dict.fromkeys(names, Rigid3.identity())
+    write_poses(tmp_path / "poses.txt", poses)
+    assert sorted(read_poses(tmp_path / "poses.txt")) == sorted(names)
+
+
+def test_a_name_with_numbers_in_it_is_no_camera(tmp_path: Path) -> None:
+    name = "Trip IMG 20240101 123456 copy.jpg"
+    other = "b.jpg FOV 640 480 500 500 320 240 0.9"  # of COLMAP; its name is all that is asked for
+    assert read_names(write(tmp_path / "map.txt", f"{name}\n{other}\n")) == [name, "b.jpg"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.conftest import Demo
@@ -16,7 +16,13 @@ from tests.unit.test_database_damage import alter_byte, alter_entry
 from trigpoint.database import schema
 from trigpoint.database.codec import Profile, decode_descriptors, encode_descriptors
 from trigpoint.database.reader import MapReader
-from trigpoint.database.replacing import compact_map, new_map, resumable_map
+from trigpoint.database.replacing import (
+    compact_map,
+    growing_map,
+    name_map,
+    new_map,
+    partial_map,
+)
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import Frame, Localized, describe, restore_descriptors
@@ -36,7 +42,6 @@ def make_compact(path: Path, num_images: int) -> Path:
     return path
 
 
-@settings(deadline=None)
 @given(dim=st.integers(1, 300), seed=st.integers(0, 2**32 - 1))
 def test_descriptors_of_two_bits_are_near_what_they_were(dim: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -152,20 +157,34 @@ def test_a_build_that_goes_on_keeps_its_profile(tmp_path: Path) -> None:
     path = tmp_path / "a.tpmap"
     with (
         suppress(KeyboardInterrupt),
-        resumable_map(path, MODEL, Profile.COMPACT, resume=False) as w,
+        growing_map(path, MODEL, Profile.COMPACT, resume=False) as w,
     ):
         add(w, 0)
         w.commit()
         raise KeyboardInterrupt
     with (
         pytest.raises(DatabaseError, match="was begun with the compact profile"),
-        resumable_map(path, MODEL, Profile.STANDARD, resume=True),
+        growing_map(path, MODEL, Profile.STANDARD, resume=True),
     ):
         pass
-    with resumable_map(path, MODEL, resume=True) as w:
+    with growing_map(path, MODEL, resume=True) as w:
         add(w, 1)
+    name_map(partial_map(path), path)
     with MapReader.open(path) as reader:
         assert (len(reader), reader.profile) == (2, Profile.COMPACT)
+
+
+def test_a_map_that_another_goes_on_with_gets_no_name(tmp_path: Path) -> None:
+    path = tmp_path / "a.tpmap"
+    with growing_map(path, MODEL, resume=False) as first:
+        add(first, 0)
+    with growing_map(path, MODEL, resume=True) as second:
+        with pytest.raises(DatabaseError, match="another writer has it open"):
+            name_map(partial_map(path), path)
+        add(second, 1)
+    name_map(partial_map(path), path)
+    with MapReader.open(path) as reader:
+        assert (len(reader), reader.verify()) == (2, [])
 
 
 def test_a_flipped_bit_in_a_compact_map_is_found(tmp_path: Path) -> None:
@@ -174,7 +193,7 @@ def test_a_flipped_bit_in_a_compact_map_is_found(tmp_path: Path) -> None:
     with MapReader.open(path) as reader:
         with pytest.raises(DatabaseError, match="image 1 is damaged"):
             reader.anchor(1)
-        assert reader.verify() == ["image 1 is damaged: its checksum does not match"]
+        assert reader.verify() == ["image 1 is damaged: its checksum does not match (folder/1.png)"]
         reader.anchor(2)
 
 

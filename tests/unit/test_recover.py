@@ -117,7 +117,7 @@ def test_a_log_cut_off_at_any_byte_gives_its_whole_chunks(tmp_path: Path) -> Non
 
 
 @given(st.data())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_of_a_damaged_log_every_whole_chunk_is_saved_and_nothing_is_invented(
     folder: Path, data: st.DataObject
 ) -> None:
@@ -146,7 +146,7 @@ def test_of_a_damaged_log_every_whole_chunk_is_saved_and_nothing_is_invented(
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_a_log_without_chunks_is_read_up_to_where_it_breaks_off(
     folder: Path, data: st.DataObject
 ) -> None:

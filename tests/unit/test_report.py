@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -13,11 +14,13 @@ from tests.conftest import Demo
 from tests.unit.conftest import Run
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
-from trigpoint_db.commands.report import choose_shown
+from trigpoint.errors import ConfigError
 from trigpoint_db.importers.colmap import read_model
 from trigpoint_db.poses import Query, read_poses, write_poses, write_queries
+from trigpoint_db.report.cases import choose_shown
 from trigpoint_db.report.matches import HEIGHT_PX, draw_pair
 from trigpoint_db.report.page import Section, Table, write_page
+from trigpoint_db.report.results import read_results
 from trigpoint_db.report.sections import error_section
 
 EVIL = "<script>alert(1)</script>"
@@ -107,6 +110,8 @@ def test_a_report_on_results_shows_errors_times_and_refusals(
     assert "FEW_INLIERS" in page.text
     assert "2 of 3 queries have a pose" in page.text
     assert "img" not in page.tags
+    code, _, said = run("report", demo.map, *more, "--images", tmp_path, "--queries", queries)
+    assert (code, "3 images are missing" in said) == (1, True)
     code, *_ = run("report", demo.map, *more, *asked)
     assert code == 0
     page = Page(out)
@@ -120,20 +125,68 @@ def test_what_is_missing_for_a_report_is_said(run: Run, demo: Demo, tmp_path: Pa
     results.write_text('{"name": "a.jpg"}\n')
     poses = tmp_path / "poses.txt"
     poses.write_text("a.jpg 1 0 0 0 0 0 0\n")
+    of_results = ["--results", results, "--poses", poses, "--truth", poses]
     for arguments, said in (
         ([], "nothing to report on"),
         (["--results", results], "needs --poses and --truth"),
         ([demo.map, "--poses", poses], "--poses is for a report on --results"),
-        (["--results", results, "--poses", poses, "--truth", poses], "is no result of"),
-        (
-            ["--results", results, "--poses", poses, "--truth", poses, "--images", tmp_path],
-            "give MAP, --queries and --images",
+        (of_results, "is no result of"),
+        *(
+            ([*of_results, *drawn], "give MAP, --queries and --images")
+            for drawn in (
+                ["--images", tmp_path],
+                [demo.map],
+                ["--queries", poses],
+                ["--map-images", tmp_path],
+            )
         ),
+        ([*of_results, "--probes", 5], "--probes is for a report on a MAP"),
+        ([*of_results, "--apart", 0.2], "--apart is for a report on a MAP"),
+        ([demo.map, "--images", tmp_path], "140 images are missing"),
+        ([demo.map, "--map-images", tmp_path], "140 images are missing"),
     ):
         code, _, error = run("report", *arguments, "-o", out)
         assert code == 1
         assert said in error
     assert not out.exists()
+
+
+@pytest.mark.parametrize("module", ["matplotlib", "jinja2"])
+def test_what_is_not_installed_is_said_before_the_work(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    code, _, said = run("report", tmp_path / "missing.tpmap", "-o", tmp_path / "r.html")
+    assert (code, "pip install 'trigpoint[plots]'" in said) == (1, True)
+
+
+def test_a_page_takes_the_place_of_no_input(run: Run, demo: Demo) -> None:
+    image = demo.folder / "survey" / "000010.jpg"
+    before = image.read_bytes()
+    code, _, said = run("report", demo.map, "-o", image, "--images", demo.folder / "survey")
+    assert (code, "name it .html" in said) == (1, True)
+    assert image.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "",
+        "[1]",
+        '{"name": 5, "reason": null}',
+        '{"name": ["a"], "reason": null}',
+        '{"name": "a", "reason": [1]}',
+        '{"name": "a", "reason": null, "stage_ms": 5}',
+        '{"name": "a", "reason": null, "stage_ms": {"a": "x"}}',
+        '{"name": "a", "reason": null, "stage_ms": {"a": NaN}}',
+        '{"name": "a", "reason": null, "anchors": [1]}',
+    ],
+)
+def test_lines_that_are_no_results_are_named(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "results.jsonl"
+    path.write_text('{"name": "a", "reason": null}\n' + line + "\n")
+    with pytest.raises(ConfigError, match=r"results\.jsonl:2: .* is no result of"):
+        read_results(path)
 
 
 def test_texts_are_escaped_and_figures_are_not(tmp_path: Path) -> None:

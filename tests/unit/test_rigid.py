@@ -20,7 +20,7 @@ from trigpoint.rigid import (
 
 Array = NDArray[np.float64]
 
-quick = settings(max_examples=40, deadline=None)
+quick = settings(max_examples=40)
 vectors = arrays(np.float64, 3, elements=st.floats(-10, 10))
 batches = arrays(np.float64, (4, 3), elements=st.floats(-10, 10))
 

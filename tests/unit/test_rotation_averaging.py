@@ -21,7 +21,7 @@ from trigpoint.rigid import rotation_angle, rotation_from_vector
 Array = NDArray[np.float64]
 Average = Callable[[Scene], Array]
 
-quick = settings(max_examples=30, deadline=None)
+quick = settings(max_examples=30)
 seeds = st.integers(0, 2**32 - 1)
 
 

@@ -1,6 +1,7 @@
 """Images that are better left out: planted ones are found, others are not."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import Demo
 from tests.unit.conftest import Run
+from tests.unit.maps import make_map
 from trigpoint.camera import Camera
 from trigpoint.database.reader import MapReader
 from trigpoint.database.writer import MapWriter
@@ -21,6 +23,7 @@ from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import build_map
 from trigpoint_db.importers.base import PosedImage
 from trigpoint_db.importers.colmap import read_model, write_model
+from trigpoint_db.overlap import TwoView, measure_overlap
 from trigpoint_db.selection import Density, Flaw, find_needless, measure_blur, select
 
 FIRST = 112  # of the demo's images: those before are there for these to overlap with
@@ -138,8 +141,8 @@ def test_build_counts_them_and_leaves_them_out_when_asked(
     assert "duplicate" in (flaws.get("000121.jpg"), flaws.get(TWICE))
     kept = [name for name in first if name not in flaws]
     assert facts["num_images_added"] == len(kept)
-    names.write_text("\n".join(last))
-    code, said, _ = run(*asked, "--append", "--select", "--json")
+    names.write_text("\n".join([*kept, *last]))
+    code, said, _ = run("add", *asked[1:], "--skip-existing", "--select", "--json")
     assert code == 0
     facts = json.loads(said)
     assert facts["selection"]["num_images"] == len(last)
@@ -198,6 +201,7 @@ def test_the_first_of_two_that_are_near_is_kept() -> None:
     assert find_needless(poses, [1, 0], 0.1, 1.0) == {0: 1}
     assert find_needless(poses, [1, 0], 0.1, 1.0, lambda i, j: False) == {}
     assert find_needless(poses, [1, 0], float("nan"), 1.0) == {}
+    assert find_needless(poses, [1], 0.1, 1.0, first=1) == {1: 0}  # the first is there already
 
 
 def test_a_map_of_two_images_of_nothing_has_no_overlap(model: FeatureModel, tmp_path: Path) -> None:
@@ -214,3 +218,12 @@ def test_a_map_of_two_images_of_nothing_has_no_overlap(model: FeatureModel, tmp_
         assert found.to_json()["median_depth"] is None
         with pytest.raises(ConfigError, match="give --density in the map's unit"):
             select(reader, tmp_path, model.long_side_px, density=Density.from_text("10%", 15.0))
+
+
+def test_a_depth_that_is_known_is_not_lost_to_a_pair_that_shows_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pairs = iter([TwoView(np.zeros((30, 2), int), 5.0), TwoView(np.zeros((35, 2), int), math.nan)])
+    monkeypatch.setattr("trigpoint_db.overlap.verify_pair", lambda *_: next(pairs))
+    with MapReader.open(make_map(tmp_path / "m.tpmap", 3)) as reader:
+        assert measure_overlap(reader, 0, 640, enough=40) == (35, 5.0)

@@ -42,7 +42,7 @@ def require_equal(found: Similarity3 | None, truth: Similarity3, tolerance: floa
     np.testing.assert_allclose(found.t, truth.t, atol=tolerance * extent)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=SEEDS)
 def test_the_inverse_undoes_a_similarity_of_points_and_of_cameras(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -53,7 +53,7 @@ def test_the_inverse_undoes_a_similarity_of_points_and_of_cameras(seed: int) -> 
     np.testing.assert_allclose(back.move(b_from_a.move(cameras)).t, cameras.t, atol=1e-6)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=SEEDS)
 def test_a_moved_camera_sees_moved_points_where_it_saw_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -63,7 +63,7 @@ def test_a_moved_camera_sees_moved_points_where_it_saw_them(seed: int) -> None:
     np.testing.assert_allclose(seen, b_from_a.scale * cameras.apply(points), rtol=1e-6, atol=1e-6)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(seed=SEEDS, num=st.integers(2, 12))
 def test_exact_poses_give_the_similarity_back(seed: int, num: int) -> None:
     rng = np.random.default_rng(seed)
@@ -73,7 +73,7 @@ def test_exact_poses_give_the_similarity_back(seed: int, num: int) -> None:
     require_equal(found, truth)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=SEEDS)
 def test_cameras_on_a_line_are_enough_for_their_rotations_tell_the_turn_about_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -85,7 +85,7 @@ def test_cameras_on_a_line_are_enough_for_their_rotations_tell_the_turn_about_it
     require_equal(found, truth)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=SEEDS)
 def test_the_fit_is_the_least_sum_of_squares(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -109,7 +109,7 @@ def test_the_fit_is_the_least_sum_of_squares(seed: int) -> None:
         assert other > least
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=SEEDS, num_wrong=st.integers(0, 12))
 def test_wrong_poses_are_found_out_and_do_not_matter(seed: int, num_wrong: int) -> None:
     rng = np.random.default_rng(seed)

@@ -20,7 +20,7 @@ from trigpoint.rigid import Rigid3, rotate, skew
 Array = NDArray[np.float64]
 Average = Callable[[Rigid3, Rigid3], Array | None]
 
-quick = settings(max_examples=30, deadline=None)
+quick = settings(max_examples=30)
 seeds = st.integers(0, 2**32 - 1)
 both_averages = pytest.mark.parametrize(
     "average", [average_translations, average_translations_govindu]

@@ -36,7 +36,7 @@ def test_exact_observations_give_the_exact_points() -> None:
     np.testing.assert_allclose(points3d, scene.points3d, atol=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), scale=st.floats(0.01, 100))
 def test_points_follow_when_the_world_is_moved_and_scaled(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)

@@ -12,7 +12,14 @@ from pathlib import Path
 import pytest
 
 from tests.unit.conftest import Run
-from tests.unit.labor import die_of_seven, die_once, square
+from tests.unit.labor import (
+    die_of_seven,
+    die_once,
+    lack_memory_once,
+    open_file,
+    raise_odd_error,
+    square,
+)
 from tests.unit.surveys import make_survey
 from trigpoint.database.reader import MapReader
 from trigpoint.database.replacing import COMMIT_EVERY
@@ -97,6 +104,22 @@ def test_an_image_that_ends_every_process_is_named() -> None:
             next(results)
 
 
+def test_an_error_that_no_pipe_takes_is_told(tmp_path: Path) -> None:
+    with Processes(1) as workers:
+        with pytest.raises(RuntimeError, match="cannot pickle"):
+            workers.submit(open_file, tmp_path / "a").result()
+        with pytest.raises(RuntimeError, match="OddError: b"):
+            workers.submit(raise_odd_error, "b").result()
+        with pytest.raises(FileNotFoundError, match="nowhere"):
+            workers.submit(open_file, tmp_path / "nowhere" / "a").result()
+        assert workers.submit(square, 3).result() == 9
+
+
+def test_a_process_without_memory_ends(tmp_path: Path) -> None:
+    with Processes(1) as workers:
+        assert list(do_in_order(lack_memory_once, [tmp_path / "a"], workers)) == ["a"]
+
+
 def require_same_records(path: Path, other: Path) -> None:
     """Both maps hold the same, in the same order."""
     with MapReader.open(path) as a, MapReader.open(other) as b:
@@ -134,6 +157,19 @@ def num_committed(map_: Path) -> int:
         return 0
 
 
+def stop_in_the_middle(process: int, partial: Path) -> None:
+    """Stop a build after its first commit; it runs for a moment at a time, to be caught early."""
+
+    def is_stopped_in_time() -> bool:
+        os.kill(process, signal.SIGSTOP)
+        if num_committed(partial) >= COMMIT_EVERY:
+            return True
+        os.kill(process, signal.SIGCONT)
+        return False
+
+    wait_until(is_stopped_in_time)
+
+
 def children_of(process: int) -> list[int]:
     listed = [path.read_text() for path in Path(f"/proc/{process}/task").glob("*/children")]
     return [int(child) for children in listed for child in children.split()]
@@ -145,8 +181,7 @@ def test_a_build_killed_in_the_middle_goes_on(
     map_ = tmp_path / "m.tpmap"
     partial = tmp_path / "m.tpmap.partial"
     process = start_build(survey, map_, "--jobs", "2")
-    wait_until(lambda: num_committed(partial) >= COMMIT_EVERY)
-    os.kill(process.pid, signal.SIGSTOP)
+    stop_in_the_middle(process.pid, partial)
     children = children_of(process.pid)
     process.kill()
     process.communicate()
@@ -166,10 +201,11 @@ def test_ctrl_c_ends_a_build_and_leaves_what_is_done(survey: Survey, tmp_path: P
     map_ = tmp_path / "m.tpmap"
     partial = tmp_path / "m.tpmap.partial"
     process = start_build(survey, map_, "--jobs", "2")
-    wait_until(lambda: num_committed(partial) >= COMMIT_EVERY)
+    stop_in_the_middle(process.pid, partial)
     children = children_of(process.pid)
     for pid in (process.pid, *children):  # as a terminal does
         os.kill(pid, signal.SIGINT)
+    os.kill(process.pid, signal.SIGCONT)
     err = process.communicate(timeout=TIMEOUT_S)[1]
     assert process.returncode == 130
     assert "Traceback" not in err

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from trigpoint.errors import ConfigError, SourceError, TrigpointError
-from trigpoint.output import check_output
+from trigpoint.output import check_place
 from trigpointd.config import LogConfig
 from trigpointd.messages.visuals import Visuals
 from trigpointd.pipeline import Output
@@ -131,7 +131,7 @@ class RollingLog:
 
     def _check(self, inputs: Sequence[Path], *, required: bool) -> None:
         if required or self._files.folder.is_dir():
-            check_output(self._files.unnumbered(), *inputs)
+            check_place(self._files.unnumbered(), *inputs)
         self._files.check_unused()
         for path in inputs:
             if self._config.min_free_mb and self._files.owns(path):

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from trigpoint.errors import ConfigError
 from trigpoint.output import check_output
+from trigpoint_db.build import select_images
+from trigpoint_db.importers.base import Dataset
 from trigpoint_db.importers.registry import IMPORTERS, read_dataset
-from trigpoint_db.poses import read_poses, write_poses, write_queries
+from trigpoint_db.poses import read_names, read_poses, write_poses, write_queries
 from trigpoint_db.public_sets import PUBLIC_SETS
 from trigpoint_db.submit import BENCHMARKS, write_submission
 from trigpoint_db.terminal import Json
@@ -30,6 +32,37 @@ Images = Annotated[
 Poses = Annotated[
     Path | None, typer.Option(help="Poses: a file for hloc, a folder of others' for 7scenes.")
 ]
+Camera = Annotated[
+    str | None, typer.Option(help="Of tum: its name, or 'MODEL width height params...'.")
+]
+ImageTopic = Annotated[str | None, typer.Option(help="Of mcap: one of several cameras.")]
+PoseTopic = Annotated[str | None, typer.Option(help="Of mcap: one of several sources.")]
+Mount = Annotated[
+    str | None,
+    typer.Option(
+        metavar="'X Y Z QW QX QY QZ'|FRAME",
+        help="Of mcap: where the camera sits on what the poses are of, or the frame of that.",
+    ),
+]
+MaxGap = Annotated[
+    float | None,
+    typer.Option(help="Of tum, euroc, mcap: seconds between two poses, at most.", min=0),
+]
+NameList = Annotated[Path | None, typer.Option("--list", help="Only these names.")]
+SkipExisting = Annotated[
+    bool, typer.Option("--skip-existing", help="Leave out images that the map has.")
+]
+
+
+def read_listed(list_: Path | None, source: Path, format_: str | None, **options: Any) -> Dataset:
+    """Read a data set, and keep of the images to map those of a list; none is an error."""
+    dataset = read_dataset(source, format_, **options)
+    if list_ is not None:
+        dataset = replace(dataset, mapped=select_images(dataset.mapped, read_names(list_)))
+    if not dataset.mapped:
+        where = f"{list_} names none" if list_ else f"{source} has none with a pose"
+        raise ConfigError(f"there are no images to map: {where}")
+    return dataset
 
 
 @app.command("queries")
@@ -48,9 +81,17 @@ def queries_command(
     as_json: Json = False,
 ) -> None:
     """Write the queries of a data set and, where they are public, their true poses."""
-    for output in (out, truth):
-        check_output(output, source)
+    inputs = [path for path in (source, poses) if path is not None]
+    check_output(out, *inputs)
+    check_output(truth, *inputs, out)
     dataset = read_dataset(source, format_, images=images, poses=poses)
+    for output in (out, truth):
+        for folder in (source, dataset.images):
+            if output and output.exists() and output.resolve().is_relative_to(folder.resolve()):
+                raise ConfigError(
+                    f"cannot write {output}: it may be a file of the data set, in whose folder it "
+                    "is; remove it first, or name another"
+                )
     queries = [q for q in dataset.queries if fnmatchcase(q.name, select or "*")]
     if not queries:
         which = f" like {select!r}" if select and dataset.queries else ""
@@ -78,6 +119,8 @@ def submit(
     """Write poses as a public benchmark takes them (visuallocalization.net)."""
     check_output(out, poses)
     estimates = read_poses(poses)
+    if not estimates:
+        raise ConfigError(f"there is no pose in {poses}")
     write_submission(benchmark, estimates, out)
     if as_json:
         print(json.dumps({"submission": str(out), "num_poses": len(estimates)}))

@@ -14,8 +14,8 @@ from trigpoint.models.features import FeatureModel
 from trigpoint_db.experiments import ablation, anchors, averaging, methods, noise, timing
 from trigpoint_db.experiments.page import write_page
 from trigpoint_db.experiments.sets import read_scenes, read_splits, read_wholes
-from trigpoint_db.experiments.store import Store
-from trigpoint_db.figures import make_figure
+from trigpoint_db.experiments.store import Store, read_result
+from trigpoint_db.figures import require_matplotlib
 from trigpoint_db.terminal import Json, Model
 
 app = typer.Typer(help="The paper's experiments: measure, and write tables and pictures.")
@@ -44,17 +44,18 @@ class Experiment(Protocol):
 
 def open_store(output: Path) -> Store:
     """Open the folder of the results; without matplotlib, say so before the work and not after."""
-    make_figure(1, 1)
+    require_matplotlib()
     return Store(output)
 
 
 def publish(
     name: str, experiment: Experiment, result: Mapping[str, Any], store: Store, as_json: bool
 ) -> None:
-    """Keep a result, print it, and draw it."""
+    """Keep a result; print and draw what was kept, so that its rounding is that of the page."""
     path = store.write(name, result)
-    print(json.dumps(result) if as_json else experiment.write_table(result))
-    experiment.draw(result, path.with_suffix(".png"))
+    kept = read_result(path)
+    print(json.dumps(kept) if as_json else experiment.write_table(kept))
+    experiment.draw(kept, path.with_suffix(".png"))
 
 
 @app.command("noise")

@@ -37,11 +37,11 @@ def publish(
     zenoh: Zenoh = None,
 ) -> None:
     """Offer a map, and each of its commits to come, to all that `fetch` it, until stopped."""
-    session = open_session(zenoh, connect, listen)
-    with Publisher(session, check_key(key), map_) as publisher:
+    check_key(key)
+    with Publisher(open_session(zenoh, connect, listen), key, map_) as publisher:
         said = ""
         while True:
-            facts = publisher.manifest
+            facts, where = publisher.manifest, sys.stdout
             say = (
                 f"{map_}: generation {facts.generation}, {facts.num_images} images, "
                 f"{facts.num_bytes / 1e6:.1f} MB on {key}"
@@ -50,8 +50,9 @@ def publish(
                 publisher.refresh()
             except TrigpointError as error:
                 say = f"trigpoint-db: {error}; the last good state stays published"
+                where = sys.stderr
             if say != said:
-                print(say, flush=True)
+                print(say, file=where, flush=True)
                 said = say
             time.sleep(_LOOK_EVERY_S)
 
@@ -67,15 +68,16 @@ def fetch(
         bool, typer.Option("--watch", help="Go on with each new generation, until stopped.")
     ] = False,
     timeout: Annotated[
-        float, typer.Option(help="Seconds without anything coming; with --watch, no limit.", min=0)
+        float, typer.Option(help="Seconds without a chunk coming; with --watch, no limit.", min=1)
     ] = 60.0,
     as_json: Json = False,
 ) -> None:
     """Fetch a published map, or what has changed of it; a daemon that has it open takes it up."""
     check_output(out)
+    check_key(key)
     session = open_session(zenoh, connect, listen)
     try:
-        remote = RemoteMap(session, check_key(key))
+        remote = RemoteMap(session, key)
         if not watch:
             fetched = fetch_map(remote, out, patience_s=timeout, track=track)
             _print(fetched, out, as_json=as_json)

@@ -8,15 +8,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from trigpoint.database.index import MIN_ROWS
 from trigpoint.database.reader import MapReader
 from trigpoint.database.replacing import compact_map
 from trigpoint.errors import ConfigError
-from trigpoint_db.commands.build import describe_noise
+from trigpoint_db.calibrate import describe_noise
 from trigpoint_db.maps import (
     Difference,
     compare_maps,
@@ -52,13 +52,13 @@ def remove(
     listed = [] if list_ is None else read_names(list_)
     of_session = [] if session is None else find_session(map_, session)
     unwanted = list(dict.fromkeys([*(names or []), *listed, *of_session]))
-    if not unwanted:
+    if not unwanted and list_ is None:
         raise ConfigError("there is nothing to remove: give names, --names FILE or --session NAME")
     remove_images(map_, unwanted)
     if as_json:
         print(json.dumps({"map": str(map_), "num_images_removed": len(unwanted)}))
     else:
-        print(f"{map_}: {len(unwanted)} images removed")
+        print(f"{map_}: {len(unwanted)} image{'s' * (len(unwanted) != 1)} removed")
 
 
 @app.command()
@@ -220,7 +220,7 @@ def print_usage(what: str, used: dict[str, Usage], num_images: Counter[str] | No
     for name, of_name in used.items():
         counts = [num_images[name]] if num_images else []
         counts += [of_name.num_retrieved, of_name.num_localized, of_name.num_supported]
-        table.add_row(name or "none", *map(str, counts))
+        table.add_row(escape(name) or "none", *map(str, counts))
     console.print(table)
 
 
@@ -229,7 +229,7 @@ def info(map_: MapPath, as_json: Json = False) -> None:
     """Say what a map holds."""
     with MapReader.open(map_) as reader:
         noise = reader.pose_noise
-        centers = np.array([reader.view(i)[1].center for i in range(len(reader))])
+        centers = reader.poses().center
         facts: dict[str, Any] = {
             "map": str(map_),
             "num_images": len(reader),
@@ -260,11 +260,11 @@ def info(map_: MapPath, as_json: Json = False) -> None:
     table.add_row("images", str(facts["num_images"]))
     for session in facts["sessions"]:
         about = f"of session {session['name']}" if session["name"] else "of no session"
-        table.add_row(f"  {about} {session['date'] or ''}", str(session["num_images"]))
+        table.add_row(escape(f"  {about} {session['date'] or ''}"), str(session["num_images"]))
     each = facts["bytes"] / 1e3 / max(facts["num_images"], 1)
     table.add_row("size", f"{facts['bytes'] / 1e6:.1f} MB, {each:.1f} kB an image")
     table.add_row("profile", f"{facts['profile']}, {'an' if facts['has_index'] else 'no'} index")
-    table.add_row("network", f"{facts['model']} ({facts['model_sha256'][:12]})")
+    table.add_row("network", escape(f"{facts['model']} ({facts['model_sha256'][:12]})"))
     table.add_row("generation", str(facts["generation"]))
     if len(centers):
         box = ",".join(f"{x:.4g}" for x in [*centers.min(axis=0), *centers.max(axis=0)])

@@ -23,6 +23,7 @@ from trigpoint_db.build import (
     check_files,
 )
 from trigpoint_db.evaluate import evaluate, plot_paths, read_truth
+from trigpoint_db.figures import check_picture
 from trigpoint_db.latency import print_latency, read_stage_times, summarize_latency
 from trigpoint_db.localize import localize_images
 from trigpoint_db.methods.baseline import Baseline
@@ -68,8 +69,9 @@ def localize(
     as_json: Json = False,
 ) -> None:
     """Localize images; OK poses go to a file, what came of every query to another."""
-    for output in (poses, results):
-        check_output(output, map_, queries)
+    inputs = [map_, queries, *([priors] if priors else [])]
+    check_output(poses, *inputs)
+    check_output(results, *inputs, poses, in_place=True)
     wanted = read_queries(queries)
     if not wanted:
         raise ConfigError(f"{queries} names no images")
@@ -82,7 +84,7 @@ def localize(
     options = LocalizerOptions(num_anchors=anchors)
     with MapReader.open(map_, network.identity) as reader, ExitStack() as stack:
         if len(reader) == 0:
-            raise ConfigError(f"{map_} holds no images; add some: trigpoint-db build --append")
+            raise ConfigError(f"{map_} holds no images; add some: trigpoint-db add")
         localizer = Localizer(network, reader, options, time.perf_counter, matching)
         is_own = method == MethodName.LATENT_POINTS
         solver = localizer if is_own else Baseline(method, localizer)
@@ -123,7 +125,7 @@ def evaluate_command(
     as_json: Json = False,
 ) -> None:
     """Compare poses with the truth; a query without a pose counts as a failure."""
-    check_output(picture, poses, *(p for p in (truth, queries, log) if p is not None))
+    check_picture(picture, poses, *(p for p in (truth, queries, log) if p is not None))
     estimates, reference = read_poses(poses), read_truth(truth)
     names = list(reference) if queries is None else read_names(queries)
     evaluation = evaluate(estimates, reference, names)
@@ -140,4 +142,4 @@ def evaluate_command(
     if picture is not None:
         plot_paths(estimates, {name: reference[name] for name in names}, picture)
         if not as_json:
-            console.print(f"picture: {picture}", soft_wrap=True)
+            print(f"picture: {picture}")

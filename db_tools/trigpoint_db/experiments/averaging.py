@@ -21,10 +21,10 @@ from trigpoint.stages import estimate_relative_poses, find_consistent, match_anc
 from trigpoint_db.build import read_frame
 from trigpoint_db.experiments.noise import COLORS, DUELS, METHODS, OURS, estimate_centers
 from trigpoint_db.experiments.published import load_published
+from trigpoint_db.experiments.ratios import draw_ratios
 from trigpoint_db.experiments.sets import choose, identify, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import geometric_mean, markdown, median, number
-from trigpoint_db.figures import make_figure, save_figure, scale_logarithmically
 from trigpoint_db.importers.base import Dataset
 from trigpoint_db.poses import Query
 
@@ -182,26 +182,8 @@ def ratio(row: Mapping[str, Any], method: str) -> float | None:
 def draw(result: Mapping[str, Any], path: Path) -> None:
     """Draw the ratios to center averaging, set by set."""
     rows = result["rows"]
-    figure = make_figure(8, 1.5 + 0.35 * len(rows))
-    axes = figure.subplots()
-    for method, color in COLORS.items():
-        ratios = [(place, ratio(row, method)) for place, row in enumerate(rows)]
-        known = [(value, place) for place, value in ratios if value is not None]
-        axes.plot(
-            [value for value, _ in known],
-            [place for _, place in known],
-            "|" if method == OURS else "o",
-            color=color,
-            markersize=12 if method == OURS else 7,
-            label=method,
-        )
-    axes.set_yticks(range(len(rows)), [row["set"] for row in rows])
-    axes.invert_yaxis()
-    scale_logarithmically(axes)
-    axes.set_xlabel(f"median position error, over that of {OURS}")
-    axes.grid(axis="x", which="both", alpha=0.3)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
-    save_figure(figure, path)
+    ratios = {method: [ratio(row, method) for row in rows] for method in COLORS}
+    draw_ratios(path, [row["set"] for row in rows], ratios, COLORS, OURS)
 
 
 def _centimetres(row: Mapping[str, Any] | None) -> list[str]:

@@ -18,10 +18,10 @@ from trigpoint.options import LocalizerOptions
 from trigpoint.rigid import Rigid3, rotation_angle
 from trigpoint_db.build import read_frame
 from trigpoint_db.experiments.averaging import describe_choice
+from trigpoint_db.experiments.ratios import draw_ratios
 from trigpoint_db.experiments.sets import choose, identify, open_map
 from trigpoint_db.experiments.store import Store
 from trigpoint_db.experiments.tables import geometric_mean, markdown, median, number
-from trigpoint_db.figures import make_figure, save_figure, scale_logarithmically
 from trigpoint_db.importers.base import Dataset
 from trigpoint_db.methods.baseline import Baseline, Estimate
 from trigpoint_db.methods.matched import Matched, match_frame
@@ -46,7 +46,7 @@ ABOUT = {
 }
 COLORS = dict(
     zip(
-        MethodName,
+        map(str, MethodName),
         ("tab:gray", "tab:olive", "tab:orange", "tab:red", "tab:green", "tab:blue"),
         strict=True,
     )
@@ -214,26 +214,8 @@ def ratio(row: Mapping[str, Any], name: str, key: str) -> float | None:
 def draw(result: Mapping[str, Any], path: Path) -> None:
     """Draw the median position errors over that of the localizer, set by set."""
     rows = result["rows"]
-    figure = make_figure(8, 1.6 + 0.35 * len(rows))
-    axes = figure.subplots()
-    for name in result["methods"]:
-        ratios = {place: ratio(row, name, "median") for place, row in enumerate(rows)}
-        known = {place: value for place, value in ratios.items() if value is not None}
-        axes.plot(
-            [*known.values()],
-            [*known],
-            "|" if name == OURS else "o",
-            color=COLORS[MethodName(name)],
-            markersize=14 if name == OURS else 7,
-            label=name,
-        )
-    axes.set_yticks(range(len(rows)), [row["set"] for row in rows])
-    axes.invert_yaxis()
-    scale_logarithmically(axes)
-    axes.set_xlabel(f"median position error, over that of {OURS}")
-    axes.grid(axis="x", which="both", alpha=0.3)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
-    save_figure(figure, path)
+    ratios = {name: [ratio(row, name, "median") for row in rows] for name in result["methods"]}
+    draw_ratios(path, [row["set"] for row in rows], ratios, COLORS, OURS)
 
 
 def _cell(summary: Mapping[str, Any], key: str) -> str:

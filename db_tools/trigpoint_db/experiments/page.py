@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from trigpoint.errors import ConfigError
+from trigpoint.output import write_atomically
 from trigpoint_db.experiments.store import read_result
-from trigpoint_db.poses import write_atomically
 
 # By the name of the result: what it is about, and the module of this package that writes it.
 SECTIONS = {

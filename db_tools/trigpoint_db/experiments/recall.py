@@ -379,9 +379,7 @@ def _draw_recalled(figure: SubFigure, room: Mapping[str, Any]) -> None:
 def _find_shown(world: World, room: Mapping[str, Any]) -> Rigid3:
     """Return the pose of the query that is drawn."""
     shown = room["shown"]
-    # A result without the length of the flight is of all its queries.
-    num_flight = shown.get("of", room["num_queries"])
-    return flight_poses(world, num_flight, ROOM_SEED)[shown["query"]]
+    return flight_poses(world, shown["of"], ROOM_SEED)[shown["query"]]
 
 
 def _draw_view(axes: Axes, world: World, cam_from_world: Rigid3, color: str) -> None:

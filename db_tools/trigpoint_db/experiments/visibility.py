@@ -22,7 +22,7 @@ from trigpoint.errors import ConfigError
 from trigpoint.frame import Anchor
 from trigpoint.rigid import Rigid3
 from trigpoint.verdict import see_share
-from trigpoint_db.overlap import read_poses_of, verify_pair
+from trigpoint_db.overlap import verify_pair
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def find_overlapping(
 
     A query has the median depth of the others where none of the images near it tells its own.
     """
-    poses = read_poses_of(reader)
+    poses = reader.poses()
     depths = [_measure_depth(query, reader, poses, long_side_px) for query in queries]
     known = [depth for depth in depths if not math.isnan(depth)]
     if not known:

@@ -13,10 +13,12 @@ import shutil
 import stat
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -24,10 +26,10 @@ from trigpoint.database.replacing import install_map
 from trigpoint.database.snapshot import reporting, require_in_place
 from trigpoint.database.writer import keep_writers_out, let_writers_in
 from trigpoint.errors import ConfigError, SourceError
-from trigpoint_db.fleet.manifest import Manifest, hash_file
+from trigpoint_db.fleet.manifest import Manifest, hash_file, hash_whole
 
 _NUM_IN_WORK = 4  # chunks
-_MAX_LIES = 3  # of one chunk
+_MAX_LIES = 3  # of one chunk, of one manifest
 _MAX_DELAY_S = 2.0
 
 Track = Callable[[Iterable[int], str, int], Iterable[int]]
@@ -38,7 +40,7 @@ class Remote(Protocol):
 
     key: str
 
-    def get_manifest(self) -> Manifest | None:
+    def get_manifest(self, timeout_s: float) -> Manifest | None:
         """Ask for the manifest; None where nobody answers."""
         ...
 
@@ -46,9 +48,13 @@ class Remote(Protocol):
         """Ask for a chunk; a publisher that does not have it answers None."""
         ...
 
+    def cancel(self) -> None:
+        """Wait for no chunk any more, until the manifest is asked for again."""
+        ...
+
 
 class _StaleManifestError(Exception):
-    """The publisher has another map by now."""
+    """The publisher does not have a chunk: it has another map by now."""
 
 
 @dataclass(frozen=True)
@@ -70,27 +76,39 @@ def fetch_map(remote: Remote, path: Path, *, patience_s: float, track: Track) ->
 
     Waits for a publisher that is away, for `patience_s` at the most.
     """
+    sizes = list[int]()  # of the chunks that came
+    lies = Counter[str]()
     while True:
-        patience = _Patience(remote.key, patience_s)
-        manifest = _ask_for_manifest(remote, patience)
+        manifest = _ask_for_manifest(remote, _Patience(remote.key, patience_s))
         if _is_same(path, manifest):
-            return Fetched(manifest, 0, is_new=False)
+            return Fetched(manifest, sum(sizes), is_new=False)
         try:
             with _Partial(path, manifest) as partial:
-                missing = partial.missing
-                _fetch_chunks(remote, partial, patience, track)
+                _fetch_chunks(remote, partial, _Patience(remote.key, patience_s), track, sizes)
                 partial.install()
-                num_bytes = sum(manifest.size_of(chunk) for chunk in missing)
-                return Fetched(manifest, num_bytes, is_new=True)
-        except _StaleManifestError:
-            continue
+                return Fetched(manifest, sum(sizes), is_new=True)
+        except _StaleManifestError as error:
+            lies[manifest.sha256] += 1
+            if lies[manifest.sha256] == _MAX_LIES:
+                raise SourceError(
+                    f"what is announced on {remote.key} is not to be had there, {_MAX_LIES} times; "
+                    "let only one publisher have that key, and restart it"
+                ) from error
+            if lies[manifest.sha256] > 1:  # at first it has just moved on
+                time.sleep(_MAX_DELAY_S)
 
 
 def _is_same(path: Path, manifest: Manifest) -> bool:
-    if not path.is_file() or path.stat().st_size != manifest.num_bytes:
+    if not path.is_file() or (status := path.stat()).st_size != manifest.num_bytes:
         return False
-    with path.open("rb") as file:
-        return hash_file(file.fileno()).sha256 == manifest.sha256
+    state = status.st_dev, status.st_ino, status.st_size, status.st_ctime_ns
+    return _hash_once(path, state) == manifest.sha256
+
+
+@lru_cache(maxsize=1)
+def _hash_once(path: Path, _state: tuple[int, ...]) -> str:
+    """Hash a file, again only when its state is another one: `--watch` asks for ever."""
+    return hash_whole(path)
 
 
 class _Patience:
@@ -102,6 +120,10 @@ class _Patience:
         self._last_s = time.monotonic()
         self._is_over = threading.Event()
 
+    @property
+    def left_s(self) -> float:
+        return max(0.0, self._last_s + self._limit_s - time.monotonic())
+
     def renew(self) -> None:
         self._last_s = time.monotonic()
 
@@ -111,37 +133,51 @@ class _Patience:
 
     def attempts(self) -> Iterator[None]:
         delay_s = 0.05
-        while not self._is_over.is_set():
+        while True:
             yield
-            if time.monotonic() - self._last_s > self._limit_s:
-                break
+            self._require()
             self._is_over.wait(delay_s)
             delay_s = min(2 * delay_s, _MAX_DELAY_S)
-        raise SourceError(
-            f"nothing came on {self._key} for {self._limit_s:g} s; is `trigpoint-db publish` "
-            "running, and reached by --connect? What has come is kept: the same command goes on"
-        )
+
+    def wait_for(self, future: Future[None]) -> None:
+        """Wait for one of those who attempt; what the others get is reason to wait longer."""
+        while wait([future], min(self.left_s, threading.TIMEOUT_MAX)).not_done:
+            self._require()
+        future.result()
+
+    def _require(self) -> None:
+        if self._is_over.is_set() or not self.left_s:
+            raise SourceError(
+                f"nothing came on {self._key} for {self._limit_s:g} s; is `trigpoint-db publish` "
+                "running, and reached by --connect? What has come is kept: the same command goes on"
+            )
 
 
 def _ask_for_manifest(remote: Remote, patience: _Patience) -> Manifest:
     for _ in patience.attempts():
-        manifest = remote.get_manifest()
+        manifest = remote.get_manifest(patience.left_s)
         if manifest is not None:
-            patience.renew()
             return manifest
     raise AssertionError  # `attempts` ends with an error only
 
 
-def _fetch_chunks(remote: Remote, partial: _Partial, patience: _Patience, track: Track) -> None:
-    def fetch(chunk: int) -> int:
-        partial.write(chunk, _fetch_chunk(remote, partial.manifest, chunk, patience))
-        return chunk
+def _fetch_chunks(
+    remote: Remote, partial: _Partial, patience: _Patience, track: Track, sizes: list[int]
+) -> None:
+    def fetch(chunk: int) -> None:
+        data = _fetch_chunk(remote, partial.manifest, chunk, patience)
+        partial.write(chunk, data)
+        sizes.append(len(data))
 
-    with ThreadPoolExecutor(_NUM_IN_WORK) as executor, ExitStack() as at_end:
-        at_end.callback(patience.end)
-        fetched = executor.map(fetch, partial.missing)
-        for _ in track(fetched, "fetching", len(partial.missing)):
-            pass
+    with ThreadPoolExecutor(_NUM_IN_WORK) as executor:
+        try:
+            futures = {chunk: executor.submit(fetch, chunk) for chunk in partial.missing}
+            for chunk in track(partial.missing, "fetching", len(partial.missing)):
+                patience.wait_for(futures[chunk])
+        finally:  # before the executor waits for its threads
+            executor.shutdown(wait=False, cancel_futures=True)
+            patience.end()
+            remote.cancel()
 
 
 def _fetch_chunk(remote: Remote, manifest: Manifest, chunk: int, patience: _Patience) -> bytes:
@@ -229,7 +265,9 @@ class _Partial:
 
     def install(self) -> None:
         """Check the whole, and put it in the place of the old map, with its owner and mode."""
-        if hash_file(self._fd).sha256 != self.manifest.sha256:
+        with reporting(self._path):
+            sha256 = hash_whole(self._path)
+        if sha256 != self.manifest.sha256:
             self._path.unlink()
             raise SourceError(
                 f"{self._path}: the whole does not have the hash of its manifest; restart the "

@@ -15,7 +15,8 @@ from trigpoint.errors import ConfigError
 from trigpoint_db.fleet.manifest import Manifest
 from trigpoint_db.fleet.offer import Offer
 
-_REPLY_TIMEOUT_S = 60  # the chunks in work on a link of 1 Mbit/s
+_REPLY_TIMEOUT_S = 60.0  # the chunks in work on a link of 1 Mbit/s
+_REFUSAL = b"not in this generation"
 
 
 def open_session(
@@ -43,7 +44,7 @@ def open_session(
         ) from error
 
 
-def check_key(key: str) -> str:
+def check_key(key: str) -> None:
     """Refuse a key that Zenoh cannot have, or that stands for several."""
     try:
         zenoh.KeyExpr(key)
@@ -51,7 +52,6 @@ def check_key(key: str) -> str:
         raise ConfigError(f"{key!r} is no key; write it as trigpoint/maps/office") from error
     if "*" in key:
         raise ConfigError(f"{key!r} stands for several keys; name one")
-    return key
 
 
 class Publisher:
@@ -78,7 +78,8 @@ class Publisher:
 
         Where the map cannot be used, the error is raised, and what was published stays.
         """
-        if not self._reader.refresh():
+        is_tried = self._reader.generation == self._offer.manifest.generation
+        if not self._reader.refresh() and is_tried:
             return False
         new = Offer(self._reader, self._folder)
         with self._lock:
@@ -118,7 +119,7 @@ class Publisher:
 def _reply(query: zenoh.Query, key: str, payload: bytes | None) -> None:
     with query, contextlib.suppress(zenoh.ZError):  # who asked has left
         if payload is None:
-            query.reply_err("not in this generation", encoding=zenoh.Encoding.TEXT_PLAIN)
+            query.reply_err(_REFUSAL, encoding=zenoh.Encoding.TEXT_PLAIN)
         else:
             query.reply(key, payload)
 
@@ -130,24 +131,38 @@ class RemoteMap:
         self._session = session
         self.key = key
         self._news = threading.Event()
+        self._cancelled = zenoh.CancellationToken()
         session.declare_subscriber(f"{key}/manifest", lambda _: self._news.set())
 
-    def get_manifest(self) -> Manifest | None:
+    def get_manifest(self, timeout_s: float) -> Manifest | None:
         """Ask for the manifest; None where nobody answers."""
         self._news.clear()
-        for payload in self._get("manifest"):
+        self._cancelled = zenoh.CancellationToken()
+        for payload in self._get("manifest", min(timeout_s, _REPLY_TIMEOUT_S)):
             if payload is not None:
                 return Manifest.decode(payload)
         return None
 
     def get_chunk(self, sha256: str) -> list[bytes | None]:
         """Ask for a chunk; a publisher that does not have it answers None."""
-        return self._get(f"chunk/{sha256}")
+        return self._get(f"chunk/{sha256}", _REPLY_TIMEOUT_S)
+
+    def cancel(self) -> None:
+        """Wait for no chunk any more, until the manifest is asked for again."""
+        self._cancelled.cancel()  # type: ignore[no-untyped-call]
 
     def wait_for_news(self, timeout_s: float) -> None:
         """Wait until a manifest is announced."""
         self._news.wait(timeout_s)
 
-    def _get(self, what: str) -> list[bytes | None]:
-        replies = self._session.get(f"{self.key}/{what}", timeout=_REPLY_TIMEOUT_S)
-        return [None if reply.ok is None else reply.ok.payload.to_bytes() for reply in replies]
+    def _get(self, what: str, timeout_s: float) -> list[bytes | None]:
+        replies = self._session.get(
+            f"{self.key}/{what}", timeout=timeout_s, cancellation_token=self._cancelled
+        )
+        answers = list[bytes | None]()
+        for reply in replies:
+            if reply.ok is not None:
+                answers.append(reply.ok.payload.to_bytes())
+            elif reply.err is not None and reply.err.payload.to_bytes() == _REFUSAL:
+                answers.append(None)  # any other error is Zenoh's: nobody has answered in time
+        return answers

@@ -7,6 +7,7 @@ write beside are not needed: every image still has its own cam_from_world.
 from __future__ import annotations
 
 import mmap
+import os
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from typing import Any
 
 from trigpoint.camera import PARAMETERS, Camera
 from trigpoint.errors import ConfigError
+from trigpoint.output import write_atomically
 from trigpoint.rigid import Rigid3
 from trigpoint_db.importers.base import Dataset, PosedImage
 from trigpoint_db.poses import (
@@ -22,7 +24,6 @@ from trigpoint_db.poses import (
     is_writable,
     pose_from_numbers,
     read_lines,
-    write_atomically,
 )
 
 # COLMAP's camera models; the place in the list is the number that the binary files hold.
@@ -95,6 +96,20 @@ def read_model(folder: Path) -> list[PosedImage]:
     return [images[name] for name in sorted(images)]
 
 
+def require_no_model(folder: Path) -> None:
+    """Refuse, before any work is done, a folder that a model cannot be written to."""
+    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not nearest.is_dir():
+        raise ConfigError(f"{nearest} is no folder; name a new one for the model")
+    if not os.access(nearest, os.W_OK):
+        raise ConfigError(f"cannot write to {nearest}: permission denied")
+    names = [
+        f"{part}{kind}" for part in ("cameras", "images", "points3D") for kind in (".txt", ".bin")
+    ]
+    if any((folder / name).exists() for name in names):
+        raise ConfigError(f"{folder} holds a COLMAP model already; name another folder")
+
+
 def write_model(folder: Path, images: Iterable[PosedImage]) -> None:
     """Write a text model without points, sorted by name; equal cameras become one."""
     images = sorted(images, key=lambda image: image.name)
@@ -104,7 +119,7 @@ def write_model(folder: Path, images: Iterable[PosedImage]) -> None:
         if not is_writable(image.name) or image.name == previous:
             raise ConfigError(
                 f"cannot write the image name {image.name!r} to {folder}: names have to be "
-                "different, of printable characters, with no space at either end"
+                "different, of valid Unicode, with no space at either end"
             )
         previous = image.name
         camera_id = camera_ids.setdefault(image.camera, len(camera_ids) + 1)

@@ -20,6 +20,8 @@ def detect(root: Path) -> bool:
 
 def read(root: Path, *, images: Path | None = None, poses: Path | None = None) -> Dataset:
     """Read the list `root`; the images are in `images` or in the folder of that name beside it."""
+    if not root.is_file():
+        raise ConfigError(f"{root} is no list of images; name a file")
     if poses is None:
         raise ConfigError(f"{root} is a list of images; name the file of their poses: --poses")
     listed, posed = read_queries(root), read_poses(poses)

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
+import cv2
+
 from trigpoint.errors import ConfigError
 from trigpoint_db.importers import (
     aachen,
@@ -65,7 +67,11 @@ def read_dataset(root: Path, name: str | None = None, **options: object) -> Data
         raise ConfigError(
             f"the format {name} has no use for --{option.replace('_', '-')}; leave it out"
         )
-    return read(root, **given)
+    try:
+        return read(root, **given)
+    except (ValueError, OverflowError, cv2.error) as error:  # a number that is none, and the like
+        said = " ".join(str(error).split())[:200]
+        raise ConfigError(f"{root} is damaged, or not of the format {name}: {said}") from error
 
 
 def find_format(root: Path) -> str:

@@ -151,8 +151,10 @@ class _File:
         cx, cy = _get(where, both, "cx", width / 2), _get(where, both, "cy", height / 2)
         model, distortion = _lens(where, both)
         try:
-            params = (fx or fy or 0.0, fy or fx or 0.0, cx, cy, *distortion)
-            return Camera.from_colmap(model, width, height, params)
+            focal = [value for value in (fx, fy) if value is not None]
+            return Camera.from_colmap(
+                model, width, height, (focal[0], focal[-1], cx, cy, *distortion)
+            )
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from error
 

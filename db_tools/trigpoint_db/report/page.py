@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
+from importlib.util import find_spec
 from pathlib import Path
 
 from trigpoint.errors import ConfigError
-from trigpoint_db.poses import write_atomically
+from trigpoint.output import check_output, write_atomically
+from trigpoint_db.figures import require_matplotlib
 
 
 @dataclass(frozen=True)
@@ -38,14 +40,20 @@ class Section:
     pictures: Sequence[Picture] = ()
 
 
+def check_page(path: Path, *inputs: Path) -> None:
+    """Refuse, before any work is done, a page that cannot be made or must not be written."""
+    check_output(path, *inputs)
+    if path.suffix.lower() != ".html":  # no image, map or model of a folder is called so
+        raise ConfigError(f"cannot write a page to {path}; name it .html")
+    require_matplotlib()
+    if find_spec("jinja2") is None:
+        raise ConfigError("a report needs Jinja2; install it with: pip install 'trigpoint[plots]'")
+
+
 def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
     """Write a page that needs nothing but itself; texts may hold anything and are escaped."""
-    try:
-        from jinja2 import Environment, StrictUndefined
-    except ImportError as error:
-        raise ConfigError(
-            "a report needs Jinja2; install it with: pip install 'trigpoint[plots]'"
-        ) from error
+    from jinja2 import Environment, StrictUndefined
+
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

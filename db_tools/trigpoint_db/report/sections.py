@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trigpoint.database.reader import MapReader
 from trigpoint.rigid import Rigid3
+from trigpoint_db.calibrate import describe_noise
 from trigpoint_db.coverage import Coverage, Grade, horizontal_axes, mean_up
 from trigpoint_db.coverage_picture import draw_coverage
 from trigpoint_db.evaluate import Evaluation, draw_paths, percentile
-from trigpoint_db.figures import make_figure, to_svg
+from trigpoint_db.figures import make_figure, scale_logarithmically, to_svg
 from trigpoint_db.gaps import Place
 from trigpoint_db.maps import count_sessions
 from trigpoint_db.report.page import Section, Table
+from trigpoint_db.report.results import QueryResult
 
 Array = NDArray[np.float64]
 MAX_LISTED = 15
@@ -25,19 +26,15 @@ MAX_LISTED = 15
 
 def map_section(reader: MapReader, num_bytes: int) -> Section:
     """Say what the map is."""
-    noise = reader.pose_noise
-    centers = np.array([reader.view(i)[1].center for i in range(len(reader))]).reshape(-1, 3)
+    centers = reader.poses().center
     extent = " x ".join(f"{side:.3g}" for side in np.ptp(centers, axis=0)) if len(centers) else "-"
-    agree = "not measured"
-    if noise is not None:
-        agree = f"to {noise.position:.2g} and {100 * noise.position_drift:.2g} % of their distance"
     rows = [
         ["images", str(len(reader))],
         ["size", f"{num_bytes / 1e6:.1f} MB, {num_bytes / 1e3 / max(len(reader), 1):.1f} kB each"],
         ["sessions", ", ".join(str(s) for s in count_sessions(reader) if s) or "none"],
         ["network", reader.model.name],
         ["extent of the cameras", extent],
-        ["its poses agree", agree],
+        ["poses", describe_noise(reader.pose_noise)],
     ]
     return Section("Map", table=Table(["", ""], rows))
 
@@ -75,8 +72,6 @@ def coverage_sections(
 def error_section(positions: Array, rotations_deg: Array, text: str) -> Section:
     """Draw which share of the images is localized within an error; infinite ones are failures."""
     figure = make_figure(8.0, 3.4)
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
     for axes, errors, label in zip(
         figure.subplots(1, 2, sharey=True),
         (positions, rotations_deg),
@@ -93,10 +88,7 @@ def error_section(positions: Array, rotations_deg: Array, text: str) -> Section:
                 where="post",
                 color="#3b8bc4",
             )
-            axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axes.xaxis.set_minor_formatter(NullFormatter())
+        scale_logarithmically(axes)
         axes.axhline(1.0, color="0.5", linewidth=0.6, linestyle=":")
         axes.set(xlabel=label, ylim=(0, 1.05))
         axes.grid(color="0.5", alpha=0.25)
@@ -136,9 +128,9 @@ def timing_section(stage_ms: Sequence[Mapping[str, float]], text: str) -> Sectio
     return Section("Times", text, to_svg(figure), Table(headings, rows))
 
 
-def outcome_section(results: Sequence[Mapping[str, Any]]) -> Section:
+def outcome_section(results: Sequence[QueryResult]) -> Section:
     """Count what came of the queries."""
-    counts = Counter(result["reason"] or "LOCALIZED" for result in results)
+    counts = Counter(result.reason or "LOCALIZED" for result in results)
     rows = [
         [outcome, str(count), f"{count / len(results):.1%}"]
         for outcome, count in counts.most_common()

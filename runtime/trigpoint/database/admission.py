@@ -10,6 +10,8 @@ from trigpoint.errors import DatabaseError
 from trigpoint.frame import LocalFeatures, ModelIdentity
 from trigpoint.rigid import Rigid3
 
+MAX_COORDINATE = 1e9  # of a camera's center: beyond, a double has no tenth of a micrometre
+
 
 def require_name(name: str) -> None:
     """Refuse a name that no key can hold."""
@@ -30,6 +32,11 @@ def require_pose(name: str, cam_from_world: Rigid3) -> None:
         raise DatabaseError(f"the pose of {name!r} is a batch, {R.shape} and {t.shape}")
     if not (np.isfinite(R).all() and np.isfinite(t).all()):
         raise DatabaseError(f"the pose of {name!r} is not finite")
+    if np.abs(cam_from_world.center).max() > MAX_COORDINATE:
+        raise DatabaseError(
+            f"{name!r} stands beyond {MAX_COORDINATE:g} units of the origin; move the origin, or "
+            "mend the pose"
+        )
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-5 or np.linalg.det(R) < 0:
         raise DatabaseError(f"the R of {name!r} is no rotation")
 
@@ -56,11 +63,6 @@ def require_features(
             )
         if not np.isfinite(array).all():
             raise DatabaseError(f"{name!r} has {field} that are not finite")
-    if len(camera.params) > schema.MAX_CAMERA_PARAMETERS:
-        raise DatabaseError(
-            f"{name!r} has a {camera.model} camera, which a map cannot hold; calibrate with k3 and "
-            "higher fixed at 0 (OPENCV), or undistort the images"
-        )
     limit = (camera.width - 0.5, camera.height - 0.5)
     if ((features.keypoints < -0.5) | (features.keypoints > limit)).any():
         raise DatabaseError(

@@ -29,6 +29,7 @@ _HEADER = struct.Struct("<QHHHH")  # number, unused, kind, end of pointers, begi
 _BRANCH, _LEAF, _VALUE, _META = 1, 2, 4, 8
 # Magic, version, address, size of the mapping; twice flags, depth, counts, root; last page, commit
 _META_BODY = struct.Struct("<IIQQ IHH5Q IHH5Q QQ")
+_COMMIT = struct.Struct("<Q")
 _MAGIC, _VERSION = 0xBEEFC0DE, 1
 _FIXED_ADDRESS = 1
 _NODE_BYTES = 8  # size or child in three u16 (the third: flags), size of the key
@@ -52,9 +53,17 @@ class Meta:
     body: bytes = field(repr=False)
 
     def encode_pages(self) -> bytes:
-        """Write the first two pages of a file that has this root only."""
+        """Write the first two pages of a file that has this root only.
+
+        The other one says the same of the commit before, as LMDB writes even and odd ones in turn.
+        """
+        commits = {commit % 2: commit for commit in (self.commit, self.commit - 1)}
         return b"".join(
-            (_HEADER.pack(slot, 0, _META, 0, 0) + self.body).ljust(self.page_bytes, b"\0")
+            (
+                _HEADER.pack(slot, 0, _META, 0, 0)
+                + self.body[: -_COMMIT.size]
+                + _COMMIT.pack(commits[slot])
+            ).ljust(self.page_bytes, b"\0")
             for slot in (0, 1)
         )
 

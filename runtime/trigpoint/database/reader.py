@@ -126,6 +126,11 @@ class MapReader:
             image = _image(snapshot, index)
             return image.camera, image.cam_from_world
 
+    def poses(self) -> Rigid3:
+        """Return cam_from_world of all images (N,), by index."""
+        with self._reading() as snapshot:
+            return Rigid3.stack(_image(snapshot, i).cam_from_world for i in range(len(self)))
+
     def anchor(self, index: int) -> Anchor:
         """Return an image with its features."""
         with self._reading() as snapshot:
@@ -275,7 +280,8 @@ class MapReader:
             for index in range(len(self)):
                 with _collecting(problems):
                     name = _image(snapshot, index).name
-                    snapshot.get(schema.features_key(index))
+                    with _collecting(problems, f" ({name})"):
+                        snapshot.get(schema.features_key(index))
                     if schema.decode_index(snapshot.get(schema.name_key(name))) != index:
                         problems.append(f"the name {name!r} does not lead to image {index}")
             for block in range(rows.num_blocks):
@@ -309,11 +315,11 @@ class MapReader:
 
 
 @contextmanager
-def _collecting(problems: list[str]) -> Iterator[None]:
+def _collecting(problems: list[str], of: str = "") -> Iterator[None]:
     try:
         yield
     except DamageError as error:
-        problems.append(str(error))
+        problems.append(f"{error}{of}")
 
 
 def _require_index(snapshot: Snapshot, index: int) -> None:

@@ -11,8 +11,14 @@ from pathlib import Path
 
 from trigpoint.database.codec import Profile
 from trigpoint.database.index import MIN_ROWS, build_index
+from trigpoint.database.pages import read_meta
 from trigpoint.database.reader import MapReader
-from trigpoint.database.snapshot import lock_path, put_in_place, reporting
+from trigpoint.database.snapshot import (
+    lock_path,
+    put_in_place,
+    reporting,
+    require_in_place,
+)
 from trigpoint.database.writer import MapWriter, keep_writers_out, let_writers_in
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import ModelIdentity
@@ -25,44 +31,54 @@ def new_map(
     path: Path, model: ModelIdentity, profile: Profile = Profile.STANDARD
 ) -> Iterator[MapWriter]:
     """Write a map that is there when it is complete; one that is there already is an error."""
-    _refuse_existing(path)
-    with _partial_file(path) as partial:
+    require_new(path)
+    with spare_file(path) as partial:
         try:
             with MapWriter.create(partial, model, profile) as writer:
                 yield writer
         except DatabaseError as error:
             raise DatabaseError(str(error).replace(str(partial), str(path))) from error
-        _refuse_existing(path)
+        require_new(path)
         partial.rename(path)
 
 
 def partial_map(path: Path) -> Path:
-    """Name the file in which a map grows that `resumable_map` makes."""
+    """Name the file in which a map grows that `growing_map` makes."""
     return path.with_name(path.name + ".partial")
 
 
 @contextmanager
-def resumable_map(
+def growing_map(
     path: Path, model: ModelIdentity, profile: Profile | None = None, *, resume: bool
 ) -> Iterator[MapWriter]:
-    """Write a map that is there when it is complete, and whose commits outlive the process.
+    """Write a map whose commits outlive the process, until `name_map` gives it its name.
 
     They stay in `partial_map`, a map of its own. With `resume` the writer goes on with them, in
     their profile; without, they are an error.
     """
-    _refuse_existing(path)
+    require_new(path)
     partial = partial_map(path)
     with _open_partial(partial, model, profile or Profile.STANDARD) as writer:
         try:
             _require_begun_alike(writer, partial, profile, resume=resume)
             yield writer
+            writer.commit()
         except BaseException:
             if writer.generation == 0:  # nothing to go on with
                 _remove_map(partial)
             raise
-    _refuse_existing(path)
-    partial.rename(path)
-    _remove_map(partial)
+
+
+def name_map(whole: Path, path: Path) -> None:
+    """Give a map that has grown, or one made of it, its name; what it has grown in is removed."""
+    require_new(path)
+    partial = partial_map(path)
+    with reporting(partial), ExitStack() as stack:
+        fd = os.open(partial, os.O_RDWR)
+        stack.callback(let_writers_in, fd)
+        keep_writers_out(fd)
+        whole.rename(path)
+        _remove_map(partial)
 
 
 def _require_begun_alike(
@@ -82,8 +98,20 @@ def _require_begun_alike(
 
 def _open_partial(partial: Path, model: ModelIdentity, profile: Profile) -> MapWriter:
     if partial.exists():
+        _remove_if_empty(partial)
+    if partial.exists():
         return MapWriter.open(partial, model)
     return MapWriter.create(partial, model, profile)
+
+
+def _remove_if_empty(partial: Path) -> None:
+    """Remove the file of a process that ended as it made it, before LMDB's first commit."""
+    with reporting(partial), ExitStack() as stack:
+        fd = os.open(partial, os.O_RDWR)
+        stack.callback(let_writers_in, fd)
+        keep_writers_out(fd)
+        if not os.fstat(fd).st_size or not any(read_meta(fd, slot).commit for slot in (0, 1)):
+            _remove_map(partial)
 
 
 def compact_map(
@@ -121,7 +149,7 @@ def compact_map(
             f"{path}: is of the compact profile, and what that leaves out does not come back; "
             "rebuild it with `trigpoint-db build`"
         )
-    with closing(MapWriter.open(path, model)) as writer, _partial_file(path) as partial:
+    with closing(MapWriter.open(path, model)) as writer, spare_file(path) as partial:
         if had_index or profile not in (None, profile_before):
             _rewrite(path, partial, profile or profile_before, track)
         else:
@@ -142,7 +170,8 @@ def rewritten_map(path: Path) -> Iterator[tuple[MapReader, MapWriter]]:
     with ExitStack() as stack:
         reader = stack.enter_context(MapReader.open(path))
         stack.enter_context(closing(MapWriter.open(path, reader.model)))
-        partial = stack.enter_context(_partial_file(path))
+        reader.refresh()  # what others have committed before we keep them out
+        partial = stack.enter_context(spare_file(path))
         with _successor(path, partial, reader, reader.profile) as writer:
             yield reader, writer
         if reader.has_index:
@@ -165,6 +194,7 @@ def install_map(new: Path, path: Path) -> None:
             old = os.open(path, os.O_RDONLY)
             stack.callback(let_writers_in, old)
             keep_writers_out(old)
+            require_in_place(path, old)
         _sync(new)
         put_in_place(new, path)
         _sync(path.parent)
@@ -202,17 +232,17 @@ def _rewrite(
                 writer.commit()
 
 
-def _refuse_existing(path: Path) -> None:
-    if path.exists():
+def require_new(path: Path) -> None:
+    """Refuse to make a map where there is a file already."""
+    if path.exists() or path.is_symlink():
         raise DatabaseError(
-            f"{path} exists; name another file, remove it, or add to it: trigpoint-db build "
-            "--append"
+            f"{path} exists; name another file, remove it, or add to it: trigpoint-db add"
         )
 
 
 @contextmanager
-def _partial_file(path: Path) -> Iterator[Path]:
-    """Name a file beside a map for its making; no such file stays, nor those of killed processes.
+def spare_file(path: Path) -> Iterator[Path]:
+    """Name a file beside a map for making it; no such file stays, nor those of killed processes.
 
     Each process has one of its own, so that two at once do not meet.
     """

@@ -122,7 +122,7 @@ class Retrieval:
         is_known = np.zeros(num_images, bool)
         if index is not None and (prior is None or is_inside.sum() > MAX_SCANNED):
             is_known[: index.num_rows] = True
-            is_known[[i for i in index.moved if i < num_images]] = False
+            is_known[self._moved] = False
         scanned = self.rows(np.flatnonzero(is_inside & ~is_known))
         found = [_compare(descriptor, bonus, *part) for part in scanned]
         if is_known.any():
@@ -156,6 +156,13 @@ class Retrieval:
     def _nearest_lists(self, descriptor: Array32) -> list[int]:
         order: list[int] = np.argsort(-(self._centroids @ descriptor), kind="stable").tolist()
         return order
+
+    @cached_property
+    def _moved(self) -> Index:
+        """The images whose rows the index does not know, for they have the place of others."""
+        index = self._metadata.index
+        moved = np.array(index.moved if index else (), np.intp)
+        return moved[moved < self._metadata.num_images]
 
     @cached_property
     def _centroids(self) -> Array32:

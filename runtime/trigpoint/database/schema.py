@@ -54,11 +54,11 @@ from trigpoint.rigid import Rigid3
 
 Array32 = NDArray[np.float32]
 
-FORMAT = 4
+FORMAT = 5
 BLOCK_ROWS = 256
 MAX_NAME_BYTES = 500  # LMDB's keys end at 511
 MAX_KEYPOINTS = 65_535
-MAX_CAMERA_PARAMETERS = 8
+MAX_CAMERA_PARAMETERS = 12
 MAX_SESSIONS = 65_535
 NO_SESSION = 0
 
@@ -220,7 +220,7 @@ def encode_image(
     camera: Camera,
     cam_from_world: Rigid3,
     features: LocalFeatures,
-    profile: Profile = Profile.STANDARD,
+    profile: Profile,
 ) -> tuple[bytes, bytes]:
     """Write an image and its features."""
     step = _keypoint_step_px(camera)
@@ -301,7 +301,7 @@ def decode_image(payload: memoryview) -> Image:
 
 
 def decode_features(
-    image: Image, payload: memoryview, dim: int, profile: Profile = Profile.STANDARD
+    image: Image, payload: memoryview, dim: int, profile: Profile
 ) -> tuple[Array32, NDArray[np.int8]]:
     """Read keypoints (N, 2) in px and quantized descriptors (N, D)."""
     fixed, descriptors = _split(image, payload, dim, profile)

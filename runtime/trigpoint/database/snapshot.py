@@ -6,7 +6,7 @@ import errno
 import fcntl
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from trigpoint.frame import ModelIdentity
 MAX_MAP_BYTES = 2**37  # of address space, not of disk; arm64 kernels may offer no more than 2**39
 OVERWRITTEN = "overwritten while open (replace maps by renaming, not in place)"
 _COPY_BYTES = 2**20
+_MAX_TRIES = 100_000  # of a few microseconds; closing a large map may take milliseconds
 LOCK_BYTES = 16_384  # more than the lock file of LMDB's 126 readers needs
 
 # LMDB wants one environment for a file in a process: readers and a writer share it. The keys are
@@ -105,7 +106,7 @@ def _open_environment(path: Path) -> lmdb.Environment:
     try:
         _reserve_lock(path)
         # A reader too opens for writing where it may, so that a writer can join it in this process.
-        environment = open_(readonly=not os.access(path, os.W_OK))
+        environment = _when_closed(partial(open_, readonly=not os.access(path, os.W_OK)))
     except (lmdb.Error, OSError) as error:
         code = error.code if isinstance(error, lmdb.Error) else error.errno
         no_room = (errno.EACCES, errno.EROFS, errno.ENOSPC, errno.EDQUOT)
@@ -115,6 +116,18 @@ def _open_environment(path: Path) -> lmdb.Environment:
         return open_(readonly=True, lock=False)
     environment.reader_check()  # frees what readers that died still hold
     return environment
+
+
+def _when_closed(open_: Callable[[], lmdb.Environment]) -> lmdb.Environment:
+    """Open a file that another thread may be closing: it is not to be found, and still open."""
+    for _ in range(_MAX_TRIES):
+        try:
+            return open_()
+        except lmdb.Error as error:
+            if "already open" not in str(error):
+                raise
+        os.sched_yield()
+    return open_()
 
 
 def _reserve_lock(path: Path) -> None:

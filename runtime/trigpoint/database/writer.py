@@ -63,6 +63,7 @@ class MapWriter:
         self._num_new_pages = 0  # since then, at the most
         self._sessions = list(metadata.sessions)
         self._index = metadata.index
+        self._moved = set(metadata.index.moved) if metadata.index else set[int]()
         self._rows: list[Row] = []  # of the last retrieval block, unless it is full
         self._environment: lmdb.Environment | None = _writable_environment(path, fd)
         self._txn: lmdb.Transaction | None = None
@@ -227,8 +228,7 @@ class MapWriter:
     def _note_moved(self, *indices: int) -> None:
         """Remember that the index knows other rows of these indices."""
         if self._index is not None:
-            moved = {*self._index.moved, *(i for i in indices if i < self._index.num_rows)}
-            self._index = replace(self._index, moved=tuple(sorted(moved)))
+            self._moved.update(i for i in indices if i < self._index.num_rows)
 
     def put_index(
         self,
@@ -243,7 +243,7 @@ class MapWriter:
             self._put(txn, schema.CENTROIDS_KEY, encode_centroids(centroids))
             for number, (indices, rows) in enumerate(lists):
                 self._put(txn, schema.list_key(number), encode_list(indices, rows))
-            self._index = schema.InvertedFile(num_rows, len(centroids))
+            self._index, self._moved = schema.InvertedFile(num_rows, len(centroids)), set()
 
     def set_pose_noise(self, noise: PoseNoise | None) -> None:
         """Say how well the poses of the map agree, None if that is not known."""
@@ -256,7 +256,7 @@ class MapWriter:
             num_images=self._num_images,
             pose_noise=self._pose_noise,
             sessions=tuple(self._sessions),
-            index=self._index,
+            index=self._index and replace(self._index, moved=tuple(sorted(self._moved))),
         )
         if metadata == self._metadata and not self._has_removed:
             return
