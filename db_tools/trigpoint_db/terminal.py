@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from datetime import datetime
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.console import Console
@@ -37,6 +40,31 @@ SessionName = Annotated[
 SessionDate = Annotated[
     datetime | None, typer.Option("--date", formats=["%Y-%m-%d"], help="Of the survey.")
 ]
+
+
+def fields_as_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a command have options in common with others: the fields of its dataclasses.
+
+    Typer takes an option a parameter; this makes one of each field of a parameter that is a
+    dataclass, and gives the command the dataclass.
+    """
+    own = inspect.signature(command, eval_str=True).parameters
+    kinds = {n: p.annotation for n, p in own.items() if isinstance(p.annotation, type)}
+    groups = {n: kind for n, kind in kinds.items() if is_dataclass(kind)}
+    fields = {n: inspect.signature(group, eval_str=True).parameters for n, group in groups.items()}
+    options = [option for n, p in own.items() for option in fields.get(n, {n: p}).values()]
+
+    @wraps(command)
+    def run(**values: Any) -> None:
+        for n, group in groups.items():
+            values[n] = group(**{field: values.pop(field) for field in fields[n]})
+        command(**values)
+
+    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    )
+    run.__annotations__ = {option.name: option.annotation for option in options}
+    return run
 
 
 def track(items: Iterable[T], what: str, total: int) -> Generator[T, None, None]:

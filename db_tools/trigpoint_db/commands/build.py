@@ -19,20 +19,7 @@ from trigpoint.models.features import FeatureModel
 from trigpoint.output import check_output
 from trigpoint_db.build import append_map, build_map, check_files, select_new
 from trigpoint_db.calibrate import calibrate_map, describe_noise
-from trigpoint_db.commands.datasets import (
-    Camera,
-    Format,
-    Images,
-    ImageTopic,
-    MaxGap,
-    Mount,
-    NameList,
-    Poses,
-    PoseTopic,
-    SkipExisting,
-    Source,
-    read_listed,
-)
+from trigpoint_db.commands.datasets import SkipExisting, Survey
 from trigpoint_db.commands.survey import DensityAngle, DensityText, check_images, read_density
 from trigpoint_db.demo import make_demo, prepare_folder
 from trigpoint_db.extraction import NetworkFiles, open_crew
@@ -48,6 +35,7 @@ from trigpoint_db.terminal import (
     Retrieval,
     SessionDate,
     SessionName,
+    fields_as_options,
     hint_at,
     make_session,
     track,
@@ -64,16 +52,35 @@ LeaveOut = Annotated[bool, typer.Option("--select", help="Leave out what `select
 
 @dataclass(frozen=True)
 class Work:
-    """How images come into a map, and how that is reported."""
+    """The options that say how images come into a map, and how that is reported."""
 
-    model: str
-    retrieval: Path | None
-    jobs: int
-    cluster: str | None
-    keypoints: int
-    session: Session | None
-    leaves_out: bool
-    as_json: bool
+    session_name: SessionName = None
+    date: SessionDate = None
+    keypoints: Keypoints = 1024
+    leaves_out: LeaveOut = False
+    density_text: DensityText = None
+    density_angle: DensityAngle = 15.0
+    jobs: Jobs = 1
+    cluster: Cluster = None
+    model: Model = "base"
+    retrieval: Retrieval = None
+    as_json: Json = False
+
+    @property
+    def session(self) -> Session | None:
+        """What survey the images are of."""
+        return make_session(self.session_name, self.date)
+
+    @property
+    def density(self) -> Density | None:
+        """How near two images may be to each other."""
+        if self.density_text is not None and not self.leaves_out:
+            raise ConfigError("--density is for --select: images are left out by both together")
+        return read_density(self.density_text, self.density_angle)
+
+    def load_network(self) -> FeatureModel:
+        """Load the network that extracts features."""
+        return FeatureModel.load(self.model, retrieval=self.retrieval)
 
     def write(
         self,
@@ -88,14 +95,7 @@ class Work:
             open_crew(self.jobs, self.cluster, files) as crew,
             closing(track(images, "mapping", len(images))) as tracked,
         ):
-            return write(
-                tracked,
-                folder,
-                network,
-                max_keypoints=self.keypoints,
-                session=self.session,
-                crew=crew,
-            )
+            return write(tracked, folder, network, max_keypoints=self.keypoints, crew=crew)
 
     def say(
         self, map_: Path, count: int, num_unposed: int, found: Selection, noise: PoseNoise | None
@@ -117,58 +117,28 @@ class Work:
 
 
 @app.command()
+@fields_as_options
 def build(
     map_: MapPath,
-    source: Source,
-    format_: Format = None,
-    images: Images = None,
-    poses: Poses = None,
-    camera: Camera = None,
-    image_topic: ImageTopic = None,
-    pose_topic: PoseTopic = None,
-    mount: Mount = None,
-    max_gap: MaxGap = None,
-    list_: NameList = None,
+    survey: Survey,
+    work: Work,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with a build that was interrupted.")
     ] = False,
-    session: SessionName = None,
-    date: SessionDate = None,
     profile: MapProfile = None,
-    keypoints: Keypoints = 1024,
-    select_: LeaveOut = False,
-    density: DensityText = None,
-    density_angle: DensityAngle = 15.0,
-    jobs: Jobs = 1,
-    cluster: Cluster = None,
-    model: Model = "base",
-    retrieval: Retrieval = None,
-    as_json: Json = False,
 ) -> None:
     """Make a map from images with known poses."""
-    survey, wanted = make_session(session, date), density_of(select_, density, density_angle)
-    work = Work(model, retrieval, jobs, cluster, keypoints, survey, select_, as_json)
-    dataset = read_listed(
-        list_,
-        source,
-        format_,
-        images=images,
-        poses=poses,
-        camera=camera,
-        image_topic=image_topic,
-        pose_topic=pose_topic,
-        mount=mount,
-        max_gap=max_gap,
-    )
+    session, density = work.session, work.density
+    dataset = survey.read()
     check_output(map_)
     require_new(map_)
     check_files((image.name for image in dataset.mapped), dataset.images)
-    network = FeatureModel.load(model, retrieval=retrieval)
-    write = partial(build_map, map_, resume=resume, profile=profile, named=False)
+    network = work.load_network()
+    write = partial(build_map, map_, resume=resume, profile=profile, session=session, named=False)
     with hint_at("--resume"), spare_file(map_) as spare:
         count, whole = work.write(write, dataset.mapped, dataset.images, network), partial_map(map_)
-        found = check_images(whole, dataset.images, network, density=wanted)
-        if select_ and found.findings:
+        found = check_images(whole, dataset.images, network, density=density)
+        if work.leaves_out and found.findings:
             if len(found.findings) == count:
                 raise ConfigError(
                     f"--select would leave out all {count} images; see what the map is like "
@@ -181,66 +151,30 @@ def build(
 
 
 @app.command()
+@fields_as_options
 def add(
     map_: MapPath,
-    source: Source,
-    format_: Format = None,
-    images: Images = None,
-    poses: Poses = None,
-    camera: Camera = None,
-    image_topic: ImageTopic = None,
-    pose_topic: PoseTopic = None,
-    mount: Mount = None,
-    max_gap: MaxGap = None,
-    list_: NameList = None,
+    survey: Survey,
+    work: Work,
     skip_existing: SkipExisting = False,
-    session: SessionName = None,
-    date: SessionDate = None,
-    keypoints: Keypoints = 1024,
-    select_: LeaveOut = False,
-    density: DensityText = None,
-    density_angle: DensityAngle = 15.0,
-    jobs: Jobs = 1,
-    cluster: Cluster = None,
-    model: Model = "base",
-    retrieval: Retrieval = None,
-    as_json: Json = False,
 ) -> None:
     """Add images with known poses to a map; each is there for good, and used, once it is added."""
-    survey, wanted = make_session(session, date), density_of(select_, density, density_angle)
-    work = Work(model, retrieval, jobs, cluster, keypoints, survey, select_, as_json)
-    dataset = read_listed(
-        list_,
-        source,
-        format_,
-        images=images,
-        poses=poses,
-        camera=camera,
-        image_topic=image_topic,
-        pose_topic=pose_topic,
-        mount=mount,
-        max_gap=max_gap,
-    )
+    session, density = work.session, work.density
+    dataset = survey.read()
     check_output(map_, in_place=True)
     new = select_new(dataset.mapped, map_, skip_existing=skip_existing)
     check_files((image.name for image in new), dataset.images)
-    network = FeatureModel.load(model, retrieval=retrieval)
-    rest = "; `trigpoint-db select` finds what it should have left out" if select_ else ""
+    network = work.load_network()
+    write = partial(append_map, map_, session=session)
+    rest = "; `trigpoint-db select` finds what it should have left out" if work.leaves_out else ""
     with hint_at(f"--skip-existing{rest}"):
-        count = work.write(partial(append_map, map_), new, dataset.images, network)
-        found = check_images(map_, dataset.images, network, num_new=count, density=wanted)
-        if select_ and found.findings:
+        count = work.write(write, new, dataset.images, network)
+        found = check_images(map_, dataset.images, network, num_new=count, density=density)
+        if work.leaves_out and found.findings:
             leave_out(map_, found.names)
             count -= len(found.findings)
         noise = calibrate_map(map_, network, track_calibration)
     work.say(map_, count, dataset.num_unposed, found, noise)
-
-
-def density_of(leaves_out: bool, text: str | None, angle_deg: float) -> Density | None:
-    """Make what --density and --density-angle say, beside --select."""
-    if text is not None and not leaves_out:
-        raise ConfigError("--density is for --select: images are left out by both together")
-    return read_density(text, angle_deg)
 
 
 @app.command()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -54,15 +54,32 @@ SkipExisting = Annotated[
 ]
 
 
-def read_listed(list_: Path | None, source: Path, format_: str | None, **options: Any) -> Dataset:
-    """Read a data set, and keep of the images to map those of a list; none is an error."""
-    dataset = read_dataset(source, format_, **options)
-    if list_ is not None:
-        dataset = replace(dataset, mapped=select_images(dataset.mapped, read_names(list_)))
-    if not dataset.mapped:
-        where = f"{list_} names none" if list_ else f"{source} has none with a pose"
-        raise ConfigError(f"there are no images to map: {where}")
-    return dataset
+@dataclass(frozen=True)
+class Survey:
+    """The options that name a data set to map."""
+
+    source: Source
+    format_: Format = None
+    images: Images = None
+    poses: Poses = None
+    camera: Camera = None
+    image_topic: ImageTopic = None
+    pose_topic: PoseTopic = None
+    mount: Mount = None
+    max_gap: MaxGap = None
+    list_: NameList = None
+
+    def read(self) -> Dataset:
+        """Read it, and keep of the images to map those of the list; none is an error."""
+        options = asdict(self)
+        source, format_, list_ = (options.pop(name) for name in ("source", "format_", "list_"))
+        dataset = read_dataset(source, format_, **options)
+        if list_ is not None:
+            dataset = replace(dataset, mapped=select_images(dataset.mapped, read_names(list_)))
+        if not dataset.mapped:
+            where = f"{list_} names none" if list_ else f"{source} has none with a pose"
+            raise ConfigError(f"there are no images to map: {where}")
+        return dataset
 
 
 @app.command("queries")

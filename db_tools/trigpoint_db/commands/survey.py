@@ -19,8 +19,7 @@ from trigpoint.output import check_output
 from trigpoint_db.align import align_survey, choose_spread
 from trigpoint_db.build import append_map, check_files, select_new
 from trigpoint_db.calibrate import calibrate_map
-from trigpoint_db.commands import datasets
-from trigpoint_db.commands.datasets import Format, Source
+from trigpoint_db.commands.datasets import SkipExisting, Survey
 from trigpoint_db.importers.colmap import require_no_model, write_model
 from trigpoint_db.maps import copy_without
 from trigpoint_db.selection import Density, Selection, select
@@ -32,6 +31,7 @@ from trigpoint_db.terminal import (
     Retrieval,
     SessionDate,
     SessionName,
+    fields_as_options,
     hint_at,
     make_session,
     track,
@@ -110,23 +110,15 @@ def check_images(
 
 
 @app.command()
+@fields_as_options
 def align(
     map_: MapPath,
-    source: Source,
-    format_: Format = None,
-    images: datasets.Images = None,
-    poses: datasets.Poses = None,
-    camera: datasets.Camera = None,
-    image_topic: datasets.ImageTopic = None,
-    pose_topic: datasets.PoseTopic = None,
-    mount: datasets.Mount = None,
-    max_gap: datasets.MaxGap = None,
-    list_: datasets.NameList = None,
+    survey: Survey,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for it in the map's frame.")
     ] = None,
     apply: Annotated[bool, typer.Option("--apply", help="Add its images to the map.")] = False,
-    skip_existing: datasets.SkipExisting = False,
+    skip_existing: SkipExisting = False,
     session: SessionName = None,
     date: SessionDate = None,
     keypoints: Keypoints = 1024,
@@ -142,25 +134,14 @@ def align(
     as_json: Json = False,
 ) -> None:
     """Bring a survey with poses of its own into the frame of a map, by localizing it there."""
-    survey = make_session(session, date)
+    own_session = make_session(session, date)
     if out is None and not apply:
         raise ConfigError("give -o for the poses in the map's frame, --apply to add them, or both")
     if out is not None:
         require_no_model(out)
     if apply:
         check_output(map_, in_place=True)
-    dataset = datasets.read_listed(
-        list_,
-        source,
-        format_,
-        images=images,
-        poses=poses,
-        camera=camera,
-        image_topic=image_topic,
-        pose_topic=pose_topic,
-        mount=mount,
-        max_gap=max_gap,
-    )
+    dataset = survey.read()
     posed = dataset.mapped
     added = (
         {i.name for i in select_new(posed, map_, skip_existing=skip_existing)} if apply else set()
@@ -183,7 +164,7 @@ def align(
         with hint_at("--skip-existing" + ", without -o" * (out is not None)):
             in_work = track(new, "mapping", len(new))
             append_map(
-                map_, in_work, dataset.images, network, max_keypoints=keypoints, session=survey
+                map_, in_work, dataset.images, network, max_keypoints=keypoints, session=own_session
             )
             calibrate_map(map_, network, track_calibration)
     facts: dict[str, Any] = found.to_json()
