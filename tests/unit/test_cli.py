@@ -215,9 +215,11 @@ def test_inputs_and_devices_are_not_written_over(run: Run, place: Path) -> None:
     assert run(*build(place))[0] == 0
     asked = ["localize", place / "m.tpmap", "--images", place / "images"]
     asked += ["--queries", place / "queries.txt", "--poses"]
-    before = (place / "queries.txt").read_bytes()
+    image = place / "images" / "000000.jpg"
+    before = (place / "queries.txt").read_bytes(), image.read_bytes()
     for output, said in (
         (place / "queries.txt", "it is an input"),
+        (image, "it is an input"),
         (place / "m.tpmap", "it is an input"),
         (Path("/dev/null"), "not a regular file"),
         (place / "nowhere" / "poses.txt", "there is no folder"),
@@ -225,7 +227,10 @@ def test_inputs_and_devices_are_not_written_over(run: Run, place: Path) -> None:
         code, _, err = run(*asked, output)
         assert code == 1
         assert said in err
-    assert (place / "queries.txt").read_bytes() == before
+        code, _, err = run(*asked, place / "p.txt", "--results", output)
+        assert code == 1
+        assert said in err
+    assert ((place / "queries.txt").read_bytes(), image.read_bytes()) == before
     assert Path("/dev/null").is_char_device()
     assert run("verify", place / "m.tpmap")[0] == 0
 
@@ -339,8 +344,8 @@ def test_what_cannot_be_written_is_said_before_the_work(
 ) -> None:
     nothing = SimpleNamespace(access=lambda *_: False, W_OK=os.W_OK)  # as for who is not root
     monkeypatch.setattr("trigpoint.output.os", nothing)
-    asked = ["localize", "no.tpmap", "--images", place, "--queries", "no.txt", "--poses"]
-    code, _, err = run(*asked, place / "p.txt")
+    asked = ["localize", "no.tpmap", "--images", place, "--queries", place / "queries.txt"]
+    code, _, err = run(*asked, "--poses", place / "p.txt")
     assert (code, "p.txt: permission denied" in err) == (1, True)
 
 

@@ -457,6 +457,14 @@ def test_a_key_is_looked_at_before_an_endpoint(office: Path, out: Path, run: Run
         assert err.startswith("trigpoint-db: 'a//b' is no key")
 
 
+def test_no_map_takes_the_place_of_another_file(tmp_path: Path, endpoint: str, run: Run) -> None:
+    notes = tmp_path / "notes.txt"
+    notes.write_text("keep me")
+    code, _, err = run(*fetching(notes, endpoint, "--timeout", 1))
+    assert (code, "is no map by its name" in err) == (1, True)
+    assert notes.read_text() == "keep me"
+
+
 @pytest.mark.parametrize("listen", ["nonsense", "tcp/256.0.0.1:1"])
 def test_endpoints_that_cannot_be_used(listen: str, office: Path, run: Run) -> None:
     code, _, err = run("publish", office, "--key", KEY, "--listen", listen)

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from trigpoint.errors import TrigpointError
+from trigpoint.errors import ConfigError, TrigpointError
 from trigpoint.output import check_output
 from trigpoint_db.fleet.fetch import Fetched, fetch_map
 from trigpoint_db.fleet.zenoh import Publisher, RemoteMap, check_key, open_session
@@ -74,6 +74,11 @@ def fetch(
 ) -> None:
     """Fetch a published map, or what has changed of it; a daemon that has it open takes it up."""
     check_output(out)
+    if out.exists() and out.suffix != ".tpmap":  # a map that is damaged is replaced too
+        raise ConfigError(
+            f"cannot write {out}: it exists, and is no map by its name (.tpmap); remove it, or "
+            "name another file"
+        )
     check_key(key)
     session = open_session(zenoh, connect, listen)
     try:

@@ -69,10 +69,11 @@ def localize(
     as_json: Json = False,
 ) -> None:
     """Localize images; OK poses go to a file, what came of every query to another."""
-    inputs = [map_, queries, *([priors] if priors else [])]
+    wanted = read_queries(queries)
+    inputs = [map_, queries, images, *([priors] if priors else [])]
+    inputs += [images / query.name for query in wanted]
     check_output(poses, *inputs)
     check_output(results, *inputs, poses, in_place=True)
-    wanted = read_queries(queries)
     if not wanted:
         raise ConfigError(f"{queries} names no images")
     around = {} if priors is None else read_priors(priors)
