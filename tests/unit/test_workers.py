@@ -1,5 +1,6 @@
 """Maps built by processes: the same bytes, whoever does the work and whatever befalls them."""
 
+import fcntl
 import multiprocessing
 import os
 import signal
@@ -157,12 +158,24 @@ def num_committed(map_: Path) -> int:
         return 0
 
 
+def is_opening(map_: Path) -> bool:
+    """Whether a process is just opening a map: stopped then, it would keep us waiting for ever."""
+    fd = os.open(map_.parent, os.O_RDONLY)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(fd)
+    return False
+
+
 def stop_in_the_middle(process: int, partial: Path) -> None:
     """Stop a build after its first commit; it runs for a moment at a time, to be caught early."""
 
     def is_stopped_in_time() -> bool:
         os.kill(process, signal.SIGSTOP)
-        if num_committed(partial) >= COMMIT_EVERY:
+        if not is_opening(partial) and num_committed(partial) >= COMMIT_EVERY:
             return True
         os.kill(process, signal.SIGCONT)
         return False

@@ -84,6 +84,7 @@ def _lock_inode(path: Path) -> int:
 def _folder_held(folder: Path) -> Iterator[None]:
     """Keep others from opening or replacing maps in a folder: map and lock file belong together.
 
+    It takes milliseconds; a process that is stopped (SIGSTOP) meanwhile keeps others waiting.
     Not by a lock on either file: closing one would drop LMDB's own locks.
     """
     fd = os.open(folder, os.O_RDONLY)
