@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from weakref import getweakrefs
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from trigpoint.database import schema
 from trigpoint.database.ranking import POOL
 from trigpoint.database.reader import MapReader
 from trigpoint.database.rows import quantize_row
+from trigpoint.database.snapshot import share_environment
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import LocalFeatures, restore_descriptors
@@ -292,6 +294,14 @@ def test_opening_and_refreshing_leave_no_file_open(tmp_path: Path) -> None:
                 add(writer, index)
             assert (reader.refresh(), reader.refresh()) == (True, False)
     assert sorted(Path("/proc/self/fd").iterdir()) == before
+
+
+def test_no_callback_runs_as_a_map_closes_in_which_ctrl_c_would_be_lost(tmp_path: Path) -> None:
+    path = make_map(tmp_path / "a.tpmap", 0)
+    with path.open("rb") as file:
+        environment = share_environment(path, file.fileno())
+        with MapReader.open(path):
+            assert [known.__callback__ for known in getweakrefs(environment)] == [None]
 
 
 def test_what_is_closed_says_so(tmp_path: Path) -> None:

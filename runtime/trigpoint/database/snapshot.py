@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from weakref import WeakValueDictionary
+from weakref import ReferenceType, ref
 
 import lmdb
 
@@ -26,9 +26,9 @@ _MAX_TRIES = 100_000  # of a few microseconds; closing a large map may take mill
 LOCK_BYTES = 16_384  # more than the lock file of LMDB's 126 readers needs
 
 # LMDB wants one environment for a file in a process: readers and a writer share it. The keys are
-# process, path, file, and the inode of the lock file, 0 without one.
-_environments: WeakValueDictionary[tuple[int, Path, tuple[int, int], int], lmdb.Environment]
-_environments = WeakValueDictionary()
+# process, path, file, and the inode of the lock file, 0 without one. No WeakValueDictionary: its
+# callback comes right after LMDB has closed a file, and what Ctrl-C raises in a callback is lost.
+_environments: dict[tuple[int, Path, tuple[int, int], int], ReferenceType[lmdb.Environment]] = {}
 
 
 def share_environment(path: Path, fd: int) -> lmdb.Environment:
@@ -37,19 +37,21 @@ def share_environment(path: Path, fd: int) -> lmdb.Environment:
     status = os.fstat(fd)
     file = status.st_dev, status.st_ino
     with _folder_held(path.parent):  # against other threads too
-        of_path = {
-            (key[2], key[3]): environment
-            for key, environment in _environments.items()
-            if key[:2] == (os.getpid(), path)
-        }
-        for (open_file, _), environment in of_path.items():
-            if open_file == file:
+        locks = set()
+        for key, reference in list(_environments.items()):
+            if key[:2] != (os.getpid(), path):
+                continue
+            if (environment := reference()) is None:
+                del _environments[key]
+                continue
+            if key[2] == file:
                 return environment
+            locks.add(key[3])
         require_in_place(path, fd)
-        if _lock_inode(path) in {lock for _, lock in of_path}:
+        if _lock_inode(path) in locks:
             lock_path(path).unlink()  # of the file that was here before; this one needs its own
         environment = _open_environment(path)
-        _environments[os.getpid(), path, file, _lock_inode(path)] = environment
+        _environments[os.getpid(), path, file, _lock_inode(path)] = ref(environment)
     return environment
 
 
