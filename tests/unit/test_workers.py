@@ -220,7 +220,7 @@ def test_ctrl_c_ends_a_build_and_leaves_what_is_done(survey: Survey, tmp_path: P
         os.kill(pid, signal.SIGINT)
     os.kill(process.pid, signal.SIGCONT)
     err = process.communicate(timeout=TIMEOUT_S)[1]
-    assert process.returncode == 130
+    assert process.returncode == 130, err
     assert "Traceback" not in err
     assert err.endswith("trigpoint-db: interrupted; the same command goes on with --resume\n")
     wait_until(lambda: not any(Path(f"/proc/{child}").exists() for child in children))
