@@ -210,6 +210,15 @@ def test_a_build_killed_in_the_middle_goes_on(
     assert {path.name for path in tmp_path.iterdir()} <= {"m.tpmap", "m.tpmap-lock"}
 
 
+@pytest.fixture
+def with_ctrl_c() -> Iterator[None]:
+    """A shell's `&` has what it starts ignore SIGINT, and so would a build that a test starts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("with_ctrl_c")
 def test_ctrl_c_ends_a_build_and_leaves_what_is_done(survey: Survey, tmp_path: Path) -> None:
     map_ = tmp_path / "m.tpmap"
     partial = tmp_path / "m.tpmap.partial"
