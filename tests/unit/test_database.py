@@ -19,7 +19,7 @@ from trigpoint.database import schema
 from trigpoint.database.ranking import POOL
 from trigpoint.database.reader import MapReader
 from trigpoint.database.rows import quantize_row
-from trigpoint.database.snapshot import share_environment
+from trigpoint.database.snapshot import Snapshot, share_environment
 from trigpoint.database.writer import MapWriter
 from trigpoint.errors import DatabaseError
 from trigpoint.frame import LocalFeatures, restore_descriptors
@@ -302,6 +302,21 @@ def test_no_callback_runs_as_a_map_closes_in_which_ctrl_c_would_be_lost(tmp_path
         environment = share_environment(path, file.fileno())
         with MapReader.open(path):
             assert [known.__callback__ for known in getweakrefs(environment)] == [None]
+
+
+def test_ctrl_c_as_a_map_closes_is_what_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close = Snapshot.close
+
+    def interrupted(snapshot: Snapshot) -> None:
+        close(snapshot)
+        raise KeyboardInterrupt
+
+    path = make_map(tmp_path / "a.tpmap", 1)
+    monkeypatch.setattr(Snapshot, "close", interrupted)
+    with pytest.raises(KeyboardInterrupt), MapReader.open(path) as reader:
+        reader.close()
 
 
 def test_what_is_closed_says_so(tmp_path: Path) -> None:

@@ -303,9 +303,9 @@ class MapReader:
         self._is_closed = True
 
     def _let_go(self) -> None:
-        if self._retrieval is not None:
-            self._retrieval.snapshot.close()
-        self._retrieval = None
+        retrieval, self._retrieval = self._retrieval, None  # gone, even if Ctrl-C ends its closing
+        if retrieval is not None:
+            retrieval.snapshot.close()
 
     def __enter__(self) -> Self:
         return self
