@@ -135,7 +135,7 @@ experiments: $(READY)
 	$(BIN)/trigpoint-db experiment page $(EXPERIMENTS) docs
 	rm -rf $(EXPERIMENTS)/maps $(EXPERIMENTS)/room # the next run measures anew
 
-# Profiles of maps, and retrieval in maps of up to a million images; half an hour and 2 GB.
+# Profiles of maps, and retrieval in maps of up to a million images; ten minutes and 2 GB.
 bench-maps: $(READY)
 	@mkdir -p build/bench
 	$(BIN)/python -m benchmarks.maps $(DATA) --output build/bench/maps.md
