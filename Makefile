@@ -140,7 +140,7 @@ bench-maps: $(READY)
 	@mkdir -p build/bench
 	$(BIN)/python -m benchmarks.maps $(DATA) --output build/bench/maps.md
 
-# What the commands on maps print on real sets, into docs/maps.md; some ten minutes.
+# What the commands on maps print on real sets, into docs/maps.md; some five minutes.
 walkthrough: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.maps.walkthrough $(DATA)
 
