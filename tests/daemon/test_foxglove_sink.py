@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import signal
 import socket
 import struct
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -61,29 +63,38 @@ def sink(port: int) -> Iterator[FoxgloveSink]:
 
 
 class Viewer:
-    """Subscribes to everything."""
+    """Subscribes to everything, and looks for as long as a test may take."""
 
     def __init__(self, connection: Any) -> None:
         self.connection = connection
+        self.deadline_s = time.monotonic() + TIMEOUT_S
         self.topics: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
 
     def receive(self) -> tuple[str, bytes]:
         """Wait for the next message: topic and data."""
         while True:
-            received = self.connection.recv(TIMEOUT_S)
+            left_s = self.deadline_s - time.monotonic()
+            assert left_s > 0, self.topics
+            received = self.connection.recv(left_s)
             if isinstance(received, bytes):
                 opcode, subscription, _ = struct.unpack_from("<BIQ", received)
                 assert opcode == 1
                 return self.topics[subscription], received[13:]
-            self._subscribe(json.loads(received))
+            self._answer(json.loads(received))
 
-    def _subscribe(self, message: dict[str, Any]) -> None:
-        if message["op"] != "advertise":
-            return
-        ids = [channel["id"] for channel in message["channels"]]
-        self.topics |= {channel["id"]: channel["topic"] for channel in message["channels"]}
-        self.schemas |= {c["topic"]: c["schemaName"] for c in message["channels"]}
+    def _answer(self, message: dict[str, Any]) -> None:
+        if message["op"] == "advertise":
+            self.topics |= {channel["id"]: channel["topic"] for channel in message["channels"]}
+            self.schemas |= {c["topic"]: c["schemaName"] for c in message["channels"]}
+            self._subscribe(*(channel["id"] for channel in message["channels"]))
+        elif message["op"] == "status":
+            # The server of SDK 0.30 announces a channel a moment before it knows it.
+            unknown = re.fullmatch(r"Unknown channel ID: (\d+)", message["message"])
+            assert unknown, message
+            self._subscribe(int(unknown[1]))
+
+    def _subscribe(self, *ids: int) -> None:
         subscriptions = [{"id": id_, "channelId": id_} for id_ in ids]
         self.connection.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
 
@@ -115,9 +126,11 @@ def filming(sink: FoxgloveSink, output: Output) -> Iterator[None]:
 
     thread = threading.Thread(target=film)
     thread.start()
-    yield
-    stop.set()
-    thread.join()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 def receive_all(viewer: Viewer, topics: set[str]) -> dict[str, bytes]:

@@ -283,6 +283,7 @@ def verify(map_: MapPath, as_json: Json = False) -> None:
     else:
         for problem in problems:
             print(problem)
-        print(f"{map_}: {count} images, {len(problems) or 'no'} problems")
+        number = f"{len(problems) or 'no'} problem{'s' * (len(problems) != 1)}"
+        print(f"{map_}: {count} images, {number}")
     if problems:
         raise typer.Exit(1)
