@@ -202,6 +202,7 @@ def test_a_diverse_search_passes_over_what_looks_like_a_better_image(tmp_path: P
 
 @settings(max_examples=25)
 @given(k=st.integers(1, 40), diversity=st.floats(0.01, 1), seed=st.integers(0, 99))
+@example(k=15, diversity=0.99999, seed=31)  # all like the first, and so nearly equal
 def test_a_diverse_search_is_the_greedy_choice(
     tmp_path_factory: pytest.TempPathFactory, k: int, diversity: float, seed: int
 ) -> None:
@@ -214,12 +215,14 @@ def test_a_diverse_search_is_the_greedy_choice(
         found, _ = reader.search(query, k, diversity)
     stored = [quantize_row(make_features(i).global_descriptor) for i in pool.tolist()]
     rows = np.array([scale * row.astype(np.float64) for scale, row in stored])
-    chosen: list[int] = []
-    while len(chosen) < min(k, 300):
-        nearest = (rows @ rows[chosen].T).max(axis=1, initial=0.0)
+    place_of = {image: place for place, image in enumerate(pool.tolist())}
+    chosen = [place_of[image] for image in found.tolist()]
+    assert len(set(chosen)) == min(k, 300)
+    for number, place in enumerate(chosen):
+        nearest = (rows @ rows[chosen[:number]].T).max(axis=1, initial=0.0)
         scores = likeness - diversity * nearest
-        chosen.append(next(i for i in np.argsort(-scores, kind="stable") if i not in chosen))
-    assert found.tolist() == pool[chosen].tolist()
+        scores[chosen[:number]] = -np.inf
+        assert scores[place] > scores.max() - 1e-5  # the rounding of float32
 
 
 def test_equally_similar_images_come_in_the_order_they_were_added(tmp_path: Path) -> None:
