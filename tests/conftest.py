@@ -16,8 +16,10 @@ from trigpoint_db.calibrate import calibrate_map
 from trigpoint_db.demo import make_demo
 
 T = TypeVar("T")
-settings.register_profile("untimed", deadline=None)  # machines are shared
-settings.load_profile("untimed")
+# Machines are shared. Runs draw the same examples; with `--hypothesis-profile untimed` new ones.
+settings.register_profile("untimed", deadline=None)
+settings.register_profile("repeatable", settings.get_profile("untimed"), derandomize=True)
+settings.load_profile("repeatable")
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 
 
